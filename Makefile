@@ -1,0 +1,72 @@
+# `make help` lists what there is to do. Everything is installed into .venv and nowhere else.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+PYTHON ?= python3
+WORKERS ?= 2
+BIN := .venv/bin
+
+# The pins hold for the build of this package too, not only for what is installed.
+export PIP_CONSTRAINT := constraints.txt
+export PIP_BUILD_CONSTRAINT := constraints.txt
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+RECENT := import sys; sys.exit(sys.version_info < (3, 11))
+
+# An environment that was half made, was moved, or has lost its interpreter is made anew.
+SOUND := $(shell [ -e .venv/.made ] && [ ! -e .venv/.installing ] \
+	&& [ "$$(cat .venv/.made)" = "$(CURDIR)" ] \
+	&& $(BIN)/python -c 'import pip; $(RECENT)' 2>/dev/null && echo yes)
+
+.PHONY: help
+help: ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
+
+.PHONY: demo
+demo: .venv/.sim ## install, then run the demo into runs/demo
+	$(BIN)/offbeat demo --out runs/demo
+
+.PHONY: test
+test: .venv/.test ## install, then run all tests
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --durations=10 $(PYTEST_ARGS)
+
+.PHONY: check
+check: .venv/.test ## install, then lint, check the format and the types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+.PHONY: clean
+clean: ## remove .venv and everything that was built or cached
+	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find src tests -name __pycache__ -prune -exec rm -rf {} +
+
+.venv/.made:
+	@command -v "$(PYTHON)" >/dev/null || { \
+		echo "$(PYTHON) was not found; name Python 3.11 or later: make PYTHON=python3.12" >&2; exit 1; }
+	@"$(PYTHON)" -c '$(RECENT)' || { \
+		echo "Offbeat needs Python 3.11 or later, but $(PYTHON) is $$("$(PYTHON)" --version 2>&1);" \
+			"name another: make PYTHON=python3.12" >&2; exit 1; }
+	rm -rf .venv
+	"$(PYTHON)" -m venv .venv
+	@echo "$(CURDIR)" > $@
+
+# Torch goes first: with it in place, nothing else can bring another build of it.
+define install
+	@echo "Installing into .venv (some minutes the first time)"
+	@touch .venv/.installing
+	$(BIN)/python -m pip install --quiet torch
+	$(BIN)/python -m pip install --quiet --editable '.[$(1)]'
+	@rm .venv/.installing
+endef
+
+.venv/.sim: .venv/.made pyproject.toml constraints.txt
+	$(call install,sim)
+	@touch $@
+
+.venv/.test: .venv/.made pyproject.toml constraints.txt
+	$(call install,test)
+	@touch .venv/.sim $@ # what the tests need holds what the demo needs
+
+ifneq ($(SOUND),yes)
+.PHONY: .venv/.made
+endif

@@ -1,0 +1,125 @@
+"""One full-size run of the thesis' protocol, scored: the numbers of `results/calibration.md`.
+
+    python benchmarks/calibration.py --model ode_rnn --observed_fraction 0.3 --epochs 50
+
+Data, windows, masks, split, normalisation, models and training follow chapter 3 of the thesis: the
+draw of the public generator (seed 123), a window of 100 of 200 rows per trajectory, `divide_by_max`
+over all rows, 70/15/15 by trajectory, batches of 50. The anchored model trains with Adam 0.002,
+cosine decay and gradients clipped at norm 1 on 100 times the MSE. A killed run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import offbeat as ob
+from offbeat.files import write_json
+
+
+def protocol_data(
+    observed_fraction: float, *, n_trajectories: int = 10_000, seed: int = 0
+) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset, ob.Scaler]:
+    """Training, validation and test part, and the scaler measured on everything."""
+    recorded = ob.simulate("hopper", n_trajectories, 200, seed=123)
+    scaler = ob.Scaler.fit("divide_by_max", recorded)
+    thinned = ob.thin(ob.windows(recorded, 100, seed=seed), observed_fraction, seed=seed)
+    train, validation, test = ob.split(thinned, seed=seed)
+    return train, validation, test, scaler
+
+
+def configs(model: str, epochs: int) -> tuple[ob.ModelConfig, ob.TrainConfig]:
+    """The thesis' model and training, or the anchored model with its own."""
+    if model == "anchored_ode_gru_d":
+        training = ob.TrainConfig(
+            epochs=epochs,
+            optimizer="adam",
+            learning_rate=0.002,
+            schedule="cosine",
+            clip_norm=1.0,
+            loss_scale=100.0,
+        )
+        return ob.ModelConfig(name=model), training
+    return ob.thesis_config(model), ob.TrainConfig(epochs=epochs)
+
+
+def main(
+    model: str = "ode_rnn",
+    observed_fraction: float = 0.3,
+    epochs: int = 50,
+    seed: int = 0,
+    n_trajectories: int = 10_000,
+    threads: int = 1,
+    out: Path = Path("runs/calibration"),
+) -> None:
+    """Trains one model of the protocol and scores it on the test part.
+
+    Args:
+        model: id of the model.
+        observed_fraction: share of the rows observed.
+        epochs: to train.
+        seed: of windows, masks, split, weights and batches.
+        n_trajectories: 10,000 in the protocol.
+        threads: of torch.
+        out: folder; the run goes to a subfolder of it.
+    """
+    torch.set_num_threads(threads)
+    train, validation, test, scaler = protocol_data(
+        observed_fraction, n_trajectories=n_trajectories, seed=seed
+    )
+    model_config, train_config = configs(model, epochs)
+    made = ob.make(model_config, train, scaler=scaler, seed=seed)
+    folder = out / f"{model}-{round(100 * observed_fraction)}-{epochs}"
+    started = time.perf_counter()
+    fitted = ob.fit(made, train, validation, train_config, out=folder)
+    evaluation = ob.evaluate({model: made}, test)
+    print(evaluation.table())
+    write_json(
+        folder / "result.json",
+        {
+            "model": model,
+            "observed_fraction": observed_fraction,
+            "epochs": epochs,
+            "steps": fitted.steps,
+            "seed": seed,
+            "n_trajectories": n_trajectories,
+            "training_seconds": sum(record.seconds for record in fitted.history),
+            "seconds_of_this_call": time.perf_counter() - started,
+            "row_0_constant": ob.row_0_constant(made.batch(test)),
+            "scores": evaluation.to_dict(),
+            "machine": _machine(threads),
+        },
+    )
+    print(json.dumps({"written": str(folder / "result.json")}))
+
+
+def _machine(threads: int) -> dict[str, Any]:
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
+    ).stdout.strip()
+    return {
+        "commit": commit,
+        "processor": _processor(),
+        "threads": threads,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def _processor() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
+    return platform.processor()
+
+
+if __name__ == "__main__":
+    from jsonargparse import CLI
+
+    CLI(main)

@@ -1,0 +1,111 @@
+"""Offbeat: learning robot motion from trajectories sampled at uneven times."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from offbeat.config import ModelConfig, TrainConfig
+from offbeat.errors import (
+    DivergenceError,
+    FileFormatError,
+    InputError,
+    MissingExtraError,
+    OffbeatError,
+)
+
+if TYPE_CHECKING:
+    from offbeat.data.batch import Batch, delta, last_values
+    from offbeat.data.prepare import Scaler, split, windows
+    from offbeat.data.readers import read
+    from offbeat.data.simulate import simulate
+    from offbeat.data.store import load, save
+    from offbeat.data.thin import thin
+    from offbeat.data.trajectory import Dataset, Trajectory
+    from offbeat.evaluation import Evaluation, evaluate
+    from offbeat.inference import predict
+    from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
+    from offbeat.models.recurrence import RecurrentModel
+    from offbeat.models.zoo import make, thesis_config
+    from offbeat.scores import Score, Scores, row_0_constant
+    from offbeat.training import FitResult, fit
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Batch": "data.batch",
+    "Dataset": "data.trajectory",
+    "Evaluation": "evaluation",
+    "FitResult": "training",
+    "RecurrentModel": "models.recurrence",
+    "Scaler": "data.prepare",
+    "Score": "scores",
+    "Scores": "scores",
+    "Trajectory": "data.trajectory",
+    "delta": "data.batch",
+    "evaluate": "evaluation",
+    "fit": "training",
+    "last_values": "data.batch",
+    "load": "data.store",
+    "load_checkpoint": "models.checkpoint",
+    "make": "models.zoo",
+    "predict": "inference",
+    "read": "data.readers",
+    "row_0_constant": "scores",
+    "save": "data.store",
+    "save_checkpoint": "models.checkpoint",
+    "simulate": "data.simulate",
+    "split": "data.prepare",
+    "thesis_config": "models.zoo",
+    "thin": "data.thin",
+    "windows": "data.prepare",
+}
+
+__all__ = [
+    "Batch",
+    "Dataset",
+    "DivergenceError",
+    "Evaluation",
+    "FileFormatError",
+    "FitResult",
+    "InputError",
+    "MissingExtraError",
+    "ModelConfig",
+    "OffbeatError",
+    "RecurrentModel",
+    "Scaler",
+    "Score",
+    "Scores",
+    "TrainConfig",
+    "Trajectory",
+    "delta",
+    "evaluate",
+    "fit",
+    "last_values",
+    "load",
+    "load_checkpoint",
+    "make",
+    "predict",
+    "read",
+    "row_0_constant",
+    "save",
+    "save_checkpoint",
+    "simulate",
+    "split",
+    "thesis_config",
+    "thin",
+    "windows",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a public name when it is first asked for: `offbeat --help` needs no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'offbeat' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"offbeat.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

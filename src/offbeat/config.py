@@ -1,0 +1,193 @@
+"""Configs: frozen records, free of torch, from which the command line is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+from offbeat.errors import InputError, one_of
+
+Activation = Literal["tanh", "silu"]
+Solver = Literal["euler", "midpoint", "heun", "rk4", "dopri5", "tsit5"]
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What a model consists of. A field left at None takes the value of the zoo's entry.
+
+    Attributes:
+        name: id of the zoo's entry: `rnn`, `lstm`, `gru`, `rnn_decay`, `gru_d`, `neural_ode`,
+            `ode_rnn`, `ode_gru_d`, `anchored_ode_gru_d`.
+        hidden_size: units of the hidden state h.
+        decoder_units: hidden layers of the decoder that reads a prediction off the state.
+        cell: update at an observation. `gru` is equations 20-23, `elman` 6, `lstm` 14-19; `none`
+            leaves the state to the flow.
+        reset_after: GRU whose reset gate acts after the recurrent product, as in `torch.nn.GRU`,
+            instead of before it, as in equation 22.
+        vector_field: `mlp`, a neural ODE between observations (equation 36), or `none`.
+        field_units: hidden layers of the vector field.
+        activation: nonlinearity of the vector field.
+        solver: how the vector field is integrated over a gap.
+        steps_per_gap: steps of a fixed-step solver over one gap.
+        max_step: longest step of a fixed-step solver, in model time; each gap then takes as many
+            equal steps as it needs, at least `steps_per_gap`.
+        rtol: relative tolerance of an adaptive solver.
+        atol: absolute tolerance of an adaptive solver, in units of the state.
+        gradient: `backprop` through the solver's steps, or the `adjoint` method (algorithm 1).
+        decay: `none`; `trainable`, the gamma_h of equation 26 from the ages of all channels;
+            `vector` or `scalar`, exp(-tau gap) with one tau per unit or one in all (equation 42).
+        decay_rows: `continuous`, the decay is a function of time alone, whatever rows it is asked
+            at; `every_row`, gamma of the age compounds at every row (the thesis' protocol);
+            `observed_rows`, the state decays only where it is updated.
+        input_decay: gamma_x, last values that fade to the training mean (equation 27).
+        anchored: the state holds the channels themselves, and an observation sets them.
+        update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
+        age_input: what tells a plain cell how old its knowledge is: `elapsed` since the last
+            observed row, `delta` per channel (equation 25), `gap` since the row before, or `none`.
+        self_feeding: share of rows at which the cell's input is the model's own decoded
+            prediction in place of the observed values (one coin per row for the whole batch,
+            row 0 excepted), in training and in testing. A fault of public code, kept by name.
+        readout: `target`, the state is carried to the time asked for; `last_row`, the prediction
+            is decoded from the state after the row before (the thesis' protocol).
+        init: `normal`, weights N(0, 0.1^2) and biases 0; `fan_in`, weights N(0, 1/fan-in), biases
+            0, last layer of the vector field times 0.1.
+        typical_gap: model time of the median training gap; fixes the unit of model time.
+        gap_limit: time since the last observation saturates at this multiple of the longest one
+            met in training.
+    """
+
+    name: str = "anchored_ode_gru_d"
+    hidden_size: int | None = None
+    decoder_units: tuple[int, ...] | None = None
+    cell: Literal["none", "elman", "lstm", "gru"] | None = None
+    reset_after: bool | None = None
+    vector_field: Literal["none", "mlp"] | None = None
+    field_units: tuple[int, ...] | None = None
+    activation: Activation | None = None
+    solver: Solver | None = None
+    steps_per_gap: int | None = None
+    max_step: float | None = None
+    rtol: float | None = None
+    atol: float | None = None
+    gradient: Literal["backprop", "adjoint"] | None = None
+    decay: Literal["none", "trainable", "vector", "scalar"] | None = None
+    decay_rows: Literal["continuous", "every_row", "observed_rows"] | None = None
+    input_decay: bool | None = None
+    anchored: bool | None = None
+    update_rows: Literal["observed", "every"] | None = None
+    age_input: Literal["none", "elapsed", "delta", "gap"] | None = None
+    self_feeding: float | None = None
+    readout: Literal["target", "last_row"] | None = None
+    init: Literal["normal", "fan_in"] | None = None
+    typical_gap: float | None = None
+    gap_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        for field_ in fields(self):
+            value = getattr(self, field_.name)
+            if isinstance(value, list):  # as JSON and YAML give it
+                object.__setattr__(self, field_.name, tuple(value))
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) is not None:
+                one_of(f"model option {name}", getattr(self, name), choices)
+        for name in ("hidden_size", "steps_per_gap"):
+            _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        for name in ("max_step", "rtol", "atol", "typical_gap"):
+            _check(self, name, lambda v: v > 0, "a positive number")
+        for name in ("decoder_units", "field_units"):
+            _check(
+                self,
+                name,
+                lambda v: isinstance(v, tuple) and all(isinstance(n, int) and n >= 1 for n in v),
+                "a list of layer sizes, each at least 1",
+            )
+        _check(self, "gap_limit", lambda v: v >= 1, "at least 1")
+        _check(self, "self_feeding", lambda v: 0 <= v <= 1, "a share from 0 to 1")
+        if self.self_feeding and self.anchored:
+            raise InputError(
+                "self_feeding is an option of the plain recurrent models; an anchored model "
+                "predicts from its own state anyway: leave self_feeding at 0"
+            )
+
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "cell": ("none", "elman", "lstm", "gru"),
+    "vector_field": ("none", "mlp"),
+    "activation": ("tanh", "silu"),
+    "solver": ("euler", "midpoint", "heun", "rk4", "dopri5", "tsit5"),
+    "gradient": ("backprop", "adjoint"),
+    "decay": ("none", "trainable", "vector", "scalar"),
+    "decay_rows": ("continuous", "every_row", "observed_rows"),
+    "update_rows": ("observed", "every"),
+    "age_input": ("none", "elapsed", "delta", "gap"),
+    "readout": ("target", "last_row"),
+    "init": ("normal", "fan_in"),
+}
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a model is trained. The defaults are the thesis' protocol.
+
+    Attributes:
+        epochs: passes over the training trajectories.
+        batch_size: trajectories per step.
+        optimizer: `adamax`, `adam`, `adamw` or `sgd`.
+        learning_rate: of the optimizer, at the start.
+        schedule: `constant`, or `cosine` decay to zero over all steps.
+        clip_norm: gradients are scaled down to this global norm; None leaves them.
+        loss_scale: the mean squared error is multiplied by this. Adam-like optimizers do not
+            notice; `clip_norm` does.
+        seed: of the order of the batches (and the coins of self-feeding).
+        patience: stop when the validation MSE has not improved for so many epochs; None never
+            stops early.
+        keep: weights that `fit` leaves in the model: of the `last` epoch, or of the `best`
+            validation MSE.
+        checkpoint_every: steps between checkpoints inside an epoch; None writes one at the end
+            of each epoch only.
+    """
+
+    epochs: int = 50
+    batch_size: int = 50
+    optimizer: Literal["adamax", "adam", "adamw", "sgd"] = "adamax"
+    learning_rate: float = 1e-3
+    schedule: Literal["constant", "cosine"] = "constant"
+    clip_norm: float | None = None
+    loss_scale: float = 1.0
+    seed: int = 0
+    patience: int | None = None
+    keep: Literal["last", "best"] = "last"
+    checkpoint_every: int | None = None
+
+    def __post_init__(self) -> None:
+        one_of("optimizer", self.optimizer, ("adamax", "adam", "adamw", "sgd"))
+        one_of("schedule", self.schedule, ("constant", "cosine"))
+        one_of("value of keep", self.keep, ("last", "best"))
+        for name in ("epochs", "batch_size", "patience", "checkpoint_every"):
+            _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        for name in ("learning_rate", "clip_norm", "loss_scale"):
+            _check(self, name, lambda v: v > 0, "a positive number")
+
+
+def _check(config: Any, name: str, good: Any, expected: str) -> None:
+    value = getattr(config, name)
+    if value is None:
+        return
+    try:
+        fine = bool(good(value)) and not isinstance(value, bool)
+    except TypeError:
+        fine = False
+    if not fine:
+        raise InputError(f"{name} must be {expected}, got {value!r}")
+
+
+def from_mapping(cls: type[Any], values: dict[str, Any]) -> Any:
+    """Makes a config from a mapping, such as a JSON or YAML file gives.
+
+    Raises:
+        InputError: a key is not a field of the config; the message lists the fields.
+    """
+    known = [field_.name for field_ in fields(cls)]
+    for key in values:
+        one_of(f"key of {cls.__name__}", key, known)
+    return cls(**values)

@@ -1,0 +1,159 @@
+"""Padded tensors, the only place that pads; and the ages that follow from times and masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from offbeat.data.prepare import Scaler
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Trajectories of any lengths and times as tensors, each padded at its end.
+
+    Attributes:
+        times: (batch, rows) float64, s, relative to the first row; padding repeats the last time.
+        values: (batch, rows, channels) scaled; 0 where not known.
+        mask: (batch, rows, channels) bool, True = observed.
+        known: (batch, rows, channels) bool, True = the score knows the value.
+        valid: (batch, rows) bool, False = padding.
+    """
+
+    times: Tensor
+    values: Tensor
+    mask: Tensor
+    known: Tensor
+    valid: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        trajectories: Dataset | Sequence[Trajectory],
+        *,
+        scaler: Scaler | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> Batch:
+        """Pads trajectories into one batch.
+
+        Args:
+            trajectories: at least one; all of the same channels.
+            scaler: applied to the values; None leaves them in their units.
+            dtype: of `values`; times are always float64.
+
+        Raises:
+            InputError: there is no trajectory, or numbers of channels differ.
+        """
+        if not len(trajectories):
+            raise InputError("a batch needs at least one trajectory, got none")
+        channels = trajectories[0].channels
+        if any(t.channels != channels for t in trajectories):
+            raise InputError("trajectories of one batch must have the same channels")
+        lengths = np.array([t.rows for t in trajectories])
+        shape = (len(trajectories), int(lengths.max()))
+        valid = np.arange(shape[1]) < lengths[:, None]
+        times = np.zeros(shape)
+        values = np.full((*shape, channels), np.nan)
+        mask = np.zeros((*shape, channels), dtype=bool)
+        for i, trajectory in enumerate(trajectories):
+            rows = trajectory.rows
+            times[i, :rows] = trajectory.times - trajectory.times[0]
+            times[i, rows:] = times[i, rows - 1]
+            values[i, :rows] = trajectory.values
+            mask[i, :rows] = trajectory.observed
+        known = ~np.isnan(values)
+        if scaler is not None:
+            if len(scaler.shift) != channels:
+                raise InputError(
+                    f"the scaler has {len(scaler.shift)} channels, the data has {channels}"
+                )
+            values = scaler.scaled(values)
+        return cls(
+            torch.from_numpy(times),
+            torch.from_numpy(np.where(known, values, 0.0)).to(dtype),
+            torch.from_numpy(mask),
+            torch.from_numpy(known),
+            torch.from_numpy(valid),
+        )
+
+    def __len__(self) -> int:
+        return self.times.shape[0]
+
+    @property
+    def rows(self) -> int:
+        """Rows of the longest trajectory."""
+        return self.times.shape[1]
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.values.shape[2]
+
+    def take(self, index: Tensor | slice) -> Batch:
+        """The trajectories at these positions, trimmed to the longest of them."""
+        valid = self.valid[index]
+        rows = int(valid.sum(dim=1).max())
+        return Batch(**{f.name: getattr(self, f.name)[index][:, :rows] for f in fields(self)})
+
+    def rows_between(self, start: int, stop: int) -> Batch:
+        """The rows from `start` up to, not including, `stop`, times unchanged."""
+        return Batch(**{f.name: getattr(self, f.name)[:, start:stop] for f in fields(self)})
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Batch:
+        """Moves all tensors, and casts `values`; times stay float64."""
+        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self)}
+        batch = Batch(**moved)
+        return batch if dtype is None else replace(batch, values=batch.values.to(dtype))
+
+
+def last_index(mask: Tensor) -> Tensor:
+    """Row of the latest True strictly before each row; -1 where there was none.
+
+    Args:
+        mask: (..., rows, channels) bool.
+
+    Returns:
+        (..., rows, channels) int64.
+    """
+    rows = torch.arange(mask.shape[-2], device=mask.device)[:, None]
+    latest = torch.where(mask, rows, -1).cummax(dim=-2).values
+    return torch.cat([torch.full_like(latest[..., :1, :], -1), latest[..., :-1, :]], dim=-2)
+
+
+def delta(times: Tensor, mask: Tensor, *, since: Tensor | None = None) -> Tensor:
+    """Time since each channel was last observed, before the row's own observation: equation 25.
+
+    Args:
+        times: (..., rows) float64, s.
+        mask: (..., rows, channels) bool, True = observed.
+        since: (..., channels) s, what a channel's age counts from before its first observation;
+            by default the time of the first row, as in equation 25.
+
+    Returns:
+        (..., rows, channels) float64, s.
+    """
+    index = last_index(mask)
+    times = times[..., None].expand(index.shape)
+    start = times[..., :1, :] if since is None else since[..., None, :]
+    return times - torch.where(index >= 0, times.gather(-2, index.clamp_min(0)), start)
+
+
+def last_values(values: Tensor, mask: Tensor, *, before: Tensor) -> Tensor:
+    """The last observed value of each channel, strictly before each row.
+
+    Args:
+        values: (..., rows, channels).
+        mask: (..., rows, channels) bool, True = observed.
+        before: broadcasts to (..., 1, channels); stands before the first observation.
+
+    Returns:
+        (..., rows, channels).
+    """
+    index = last_index(mask)
+    return torch.where(index >= 0, values.gather(-2, index.clamp_min(0)), before)

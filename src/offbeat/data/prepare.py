@@ -1,0 +1,179 @@
+"""From recorded trajectories to what models are trained on: windows, splits, scales."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import InputError, one_of
+
+ScalerKind = Literal["standardise", "min_max", "divide_by_max", "identity"]
+SCALERS: tuple[str, ...] = ("standardise", "min_max", "divide_by_max", "identity")
+
+
+def windows(dataset: Dataset, length: int, *, seed: int = 0) -> Dataset:
+    """Cuts one window of consecutive rows out of each trajectory, its start drawn uniformly.
+
+    Args:
+        dataset: trajectories of at least `length` rows each.
+        length: rows of a window.
+        seed: of the draw.
+
+    Raises:
+        InputError: `length` is below 1 or a trajectory is shorter.
+    """
+    random = np.random.default_rng(seed)
+    cut = []
+    for i, trajectory in enumerate(dataset):
+        if not 1 <= length <= trajectory.rows:
+            raise InputError(
+                f"a window of {length} rows does not fit into trajectory {i} of "
+                f"{trajectory.rows} rows; use a length from 1 to {trajectory.rows}"
+            )
+        start = int(random.integers(0, trajectory.rows - length + 1))
+        cut.append(trajectory.slice(start, start + length))
+    return Dataset(tuple(cut), {**dataset.meta, "window": length})
+
+
+def split(
+    dataset: Dataset,
+    fractions: Sequence[float] = (0.7, 0.15, 0.15),
+    *,
+    seed: int = 0,
+) -> tuple[Dataset, ...]:
+    """Splits by trajectory, so that no trajectory stands in two parts.
+
+    Args:
+        dataset: trajectories to share out.
+        fractions: one per part; they sum to 1.
+        seed: of the shuffle.
+
+    Returns:
+        One data set per fraction (training, validation, test by default).
+
+    Raises:
+        InputError: fractions are not positive or do not sum to 1, or a part would be empty.
+    """
+    shares = np.asarray(fractions, dtype=float)
+    if shares.ndim != 1 or (shares <= 0).any() or abs(shares.sum() - 1) > 1e-9:
+        raise InputError(f"fractions must be positive and sum to 1, got {list(fractions)}")
+    ends = np.round(np.cumsum(shares) * len(dataset)).astype(int)
+    starts = np.concatenate([[0], ends[:-1]])
+    if (ends <= starts).any():
+        raise InputError(
+            f"{len(dataset)} trajectories are too few for the fractions {list(fractions)}: a part "
+            "would be empty; use more trajectories or fewer parts"
+        )
+    order = np.random.default_rng(seed).permutation(len(dataset))
+    return tuple(
+        dataset.take(np.sort(order[start:end])) for start, end in zip(starts, ends, strict=True)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scaler:
+    """An affine map per channel: scaled = (value - shift) / scale.
+
+    Fitted on the training part and saved with the model. `divide_by_max` is the thesis'
+    normalisation, kept for comparability by this name: `(x - min) / max`, which is not the range.
+
+    Args:
+        kind: `standardise`, `min_max`, `divide_by_max` or `identity`.
+        shift: (channels,) in the channels' units.
+        scale: (channels,) in the channels' units, not zero.
+    """
+
+    kind: str
+    shift: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        one_of("scaler", self.kind, SCALERS)
+        shift = np.asarray(self.shift, dtype=np.float64)
+        scale = np.asarray(self.scale, dtype=np.float64)
+        if shift.ndim != 1 or shift.shape != scale.shape:
+            raise InputError(f"shift and scale need one shape, got {shift.shape}, {scale.shape}")
+        if not (np.isfinite(shift).all() and np.isfinite(scale).all() and (scale != 0).all()):
+            raise InputError("shift and scale must be finite, and scale not zero")
+        object.__setattr__(self, "shift", shift)
+        object.__setattr__(self, "scale", scale)
+
+    @classmethod
+    def identity(cls, channels: int) -> Scaler:
+        """Leaves values as they are."""
+        return cls("identity", np.zeros(channels), np.ones(channels))
+
+    @classmethod
+    def fit(cls, kind: str, dataset: Dataset) -> Scaler:
+        """Measures a scale on the observed cells of a data set, per channel.
+
+        Args:
+            kind: `standardise` (mean, standard deviation), `min_max` (minimum, range),
+                `divide_by_max` (minimum, maximum) or `identity`.
+            dataset: the training part.
+
+        Raises:
+            InputError: a channel is never observed, or its maximum is 0 under `divide_by_max`.
+        """
+        one_of("scaler", kind, SCALERS)
+        count, mean, square, low, high = _moments(dataset)
+        check_observed(dataset.names, count, len(dataset))
+        if kind == "identity":
+            return cls.identity(dataset.channels)
+        if kind == "standardise":
+            deviation = np.sqrt(square)
+            # A channel that never moves carries no information; leave its size alone.
+            return cls(kind, mean, np.where(deviation > 1e-12 * np.abs(mean), deviation, 1.0))
+        if kind == "min_max":
+            return cls(kind, low, np.where(high > low, high - low, 1.0))
+        if (high == 0).any():
+            name = dataset.names[int((high == 0).argmax())]
+            raise InputError(
+                f"divide_by_max: the maximum of channel {name!r} is 0; use 'min_max' instead"
+            )
+        return cls(kind, low, high)
+
+    def scaled(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., channels) original units to scaled ones."""
+        return (values - self.shift) / self.scale
+
+    def original(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., channels) scaled values to original units."""
+        return values * self.scale + self.shift
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form; floats survive to the last bit."""
+        return {"kind": self.kind, "shift": self.shift.tolist(), "scale": self.scale.tolist()}
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> Scaler:
+        """The inverse of `to_dict`."""
+        return cls(value["kind"], np.array(value["shift"]), np.array(value["scale"]))
+
+
+def check_observed(names: Sequence[str], count: NDArray[np.int64], trajectories: int) -> None:
+    """Raises InputError when a channel has no observed cell at all."""
+    if (count == 0).any():
+        never = [name for name, n in zip(names, count, strict=True) if n == 0]
+        raise InputError(
+            f"never observed in {trajectories} training trajectories: {', '.join(never)}; leave "
+            "such channels out, nothing can be learned about them"
+        )
+
+
+def _moments(dataset: Dataset) -> tuple[NDArray[Any], ...]:
+    """Count, mean, variance, minimum and maximum of the observed cells, per channel."""
+    values = np.concatenate([t.values for t in dataset])
+    observed = np.concatenate([t.observed for t in dataset])
+    count = observed.sum(axis=0)
+    safe = np.maximum(count, 1)
+    mean = np.where(observed, values, 0).sum(axis=0) / safe
+    variance = (np.where(observed, values - mean, 0) ** 2).sum(axis=0) / safe
+    low = np.where(observed, values, np.inf).min(axis=0)
+    high = np.where(observed, values, -np.inf).max(axis=0)
+    return count, mean, variance, low, high

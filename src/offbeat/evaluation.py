@@ -1,0 +1,106 @@
+"""Evaluation: models and the trivial predictor, scored in the same call on the same cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import InputError
+from offbeat.models.recurrence import RecurrentModel
+from offbeat.scores import Scores, ScoreSums, last_value_predictions, table
+from offbeat.training import validate
+
+LAST_VALUE = "last_value"
+"""Name of the trivial predictor that stands in every table."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores by predictor; `last_value` is always among them.
+
+    Attributes:
+        scores: by predictor, in scaled units.
+        names: channel names.
+        units: channel units.
+        scaler: what the scaled units are: `standardise`, `divide_by_max`, ...
+        channel_scale: per channel, one scaled unit in the channel's unit.
+        trajectories: how many were scored.
+    """
+
+    scores: Mapping[str, Scores]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    scaler: str
+    channel_scale: tuple[float, ...]
+    trajectories: int
+
+    def table(self, *, notes: Mapping[str, str] | None = None) -> str:
+        """A plain-text table of RMSE in scaled units, best honest score first."""
+        return table(self.scores, notes=notes)
+
+    def channel_rmse(self, predictor: str) -> dict[str, float]:
+        """Honest RMSE of each channel, in the channel's own unit."""
+        mse = self.scores[predictor].honest.per_channel
+        scales = zip(self.names, mse, self.channel_scale, strict=True)
+        return {name: value**0.5 * abs(scale) for name, value, scale in scales}
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form, with the RMSE of each channel in its own unit."""
+        return {
+            "scaler": self.scaler,
+            "trajectories": self.trajectories,
+            "channels": dict(zip(self.names, self.units, strict=True)),
+            "predictors": {
+                name: {
+                    **scores.to_dict(),
+                    "honest_rmse_in_units": {
+                        k: None if v != v else v for k, v in self.channel_rmse(name).items()
+                    },
+                }
+                for name, scores in self.scores.items()
+            },
+        }
+
+
+def evaluate(
+    models: RecurrentModel | Mapping[str, RecurrentModel], dataset: Dataset, *, seed: int = 0
+) -> Evaluation:
+    """Scores one-step-ahead predictions of one or more models, and of the last observed value.
+
+    Args:
+        models: one model, or several by name; several must share scaler and training means.
+        dataset: thinned or not; hidden cells that are known are scored.
+        seed: of the coins of self-feeding.
+
+    Raises:
+        InputError: the data has other channels than a model, or models score in other units.
+    """
+    if isinstance(models, RecurrentModel):
+        models = {models.config.name: models}
+    if not models or LAST_VALUE in models:
+        raise InputError(f"give at least one model, none of them named {LAST_VALUE!r}")
+    first = next(iter(models.values()))
+    for name, model in models.items():
+        same = (
+            model.scaler.to_dict() == first.scaler.to_dict()
+            and model.statistics.mean == first.statistics.mean
+        )
+        if not same:
+            raise InputError(
+                f"{name!r} scores in other units than {next(iter(models))!r}: their scalers or "
+                "training means differ; train both on the same data, or evaluate them apart"
+            )
+    batch = first.batch(dataset)
+    trivial = ScoreSums(batch.channels, gap_unit=first.statistics.median_gap)
+    trivial.add(last_value_predictions(batch, first.mean), batch)
+    scores = {name: validate(model, batch, seed=seed) for name, model in models.items()}
+    return Evaluation(
+        {**scores, LAST_VALUE: trivial.scores()},
+        first.names,
+        first.units,
+        first.scaler.kind,
+        tuple(first.scaler.scale.tolist()),
+        len(dataset),
+    )

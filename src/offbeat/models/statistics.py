@@ -1,0 +1,89 @@
+"""What a model must know of its training data, measured once and saved with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from offbeat.data.batch import Batch, last_index
+from offbeat.errors import InputError
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Measured on the training part, in scaled units and seconds.
+
+    Attributes:
+        mean: per channel, over observed cells: the empirical mean of equation 27.
+        std: per channel, over observed cells; 1 where a channel never moves.
+        median_gap: s, between consecutive rows.
+        longest_elapsed: s, longest time from a row back to the last observed row.
+        longest_delta: s, longest age of any channel (equation 25).
+    """
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    median_gap: float
+    longest_elapsed: float
+    longest_delta: float
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.mean)
+
+    @classmethod
+    def of(cls, batch: Batch) -> Statistics:
+        """Measures a training batch.
+
+        Raises:
+            InputError: a channel is never observed, or no trajectory has two rows.
+        """
+        mask = batch.mask & batch.valid[..., None]
+        count = mask.sum(dim=(0, 1))
+        if (count == 0).any():
+            raise InputError(
+                f"channel {int((count == 0).long().argmax())} is never observed in the training "
+                "part; leave it out, nothing can be learned about it"
+            )
+        values = batch.values.double()
+        mean = torch.where(mask, values, 0.0).sum(dim=(0, 1)) / count
+        variance = (torch.where(mask, values - mean, 0.0) ** 2).sum(dim=(0, 1)) / count
+        std = variance.sqrt()
+        std = torch.where(std > 1e-7 * mean.abs().clamp_min(1e-30), std, 1.0)
+        gaps = (batch.times[:, 1:] - batch.times[:, :-1])[batch.valid[:, 1:]]
+        if not len(gaps):
+            raise InputError(
+                "every training trajectory has a single row; a model of motion needs at least one "
+                "trajectory of two rows"
+            )
+        ages = [_longest(batch, mask.any(dim=2, keepdim=True)), _longest(batch, mask)]
+        return cls(
+            tuple(mean.tolist()),
+            tuple(std.tolist()),
+            float(gaps.median()),
+            max(ages[0], float(gaps.median())),
+            max(*ages, float(gaps.median())),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form; floats survive to the last bit."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> Statistics:
+        """The inverse of `to_dict`."""
+        fields = {k: tuple(v) if isinstance(v, list) else v for k, v in value.items()}
+        return cls(**fields)
+
+
+def _longest(batch: Batch, mask: torch.Tensor) -> float:
+    """Longest time from a valid row back to the last observation before it; 0 if there is none."""
+    index = last_index(mask)
+    times = batch.times[..., None].expand(index.shape)
+    age = times - times.gather(1, index.clamp_min(0))
+    age = age[(index >= 0) & batch.valid[..., None]]
+    return float(age.max()) if len(age) else 0.0

@@ -1,0 +1,19 @@
+"""Settings that every test needs before anything heavy is imported."""
+
+import os
+
+# One thread: sums keep their order, and workers that run side by side do not fight for the cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Without a screen MuJoCo tries GLFW first and dies; EGL renders on the CPU as well.
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import hypothesis
+import torch
+
+torch.set_num_threads(1)
+
+# `ci` draws the same examples every time; HYPOTHESIS_PROFILE=explore looks for new ones.
+hypothesis.settings.register_profile("ci", derandomize=True, deadline=None, database=None)
+hypothesis.settings.register_profile("explore", deadline=None, max_examples=1000)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))

@@ -1,0 +1,168 @@
+"""Imports follow the arrow: a module imports from its own stage or from earlier ones."""
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "offbeat"
+
+# In the order of the arrow of docs/architecture.md, so that each stage can be read, tested and
+# replaced without the stages that come after it.
+STAGES = (
+    "errors",
+    "files",
+    "config",
+    "data",
+    "solvers",
+    "kernels",
+    "models",
+    "scores",
+    "training",
+    "inference",
+    "evaluation",
+    "experiment",
+    "report",
+    "demo",
+    "doctor",
+    "cli",
+    "__main__",
+    "__init__",
+)
+
+HEAVY = ("torch", "scipy.stats", "matplotlib", "mujoco", "dm_control")
+"""Slow to import; `import offbeat` and `offbeat --help` do without them."""
+
+
+def faults(source: Path) -> list[str]:
+    """What in the package at `source` goes against the arrow, a line per fault."""
+    found = []
+    for path in sorted(source.rglob("*.py")):
+        name = path.relative_to(source).with_suffix("").parts[0]
+        where = f"{source.name}/{path.relative_to(source).as_posix()}"
+        if name not in STAGES:
+            found.append(f"{where}: {name!r} belongs to no stage; add it to STAGES")
+            continue
+        for line, target in imports(path, source):
+            if name == "report" and target.split(".")[0] == "torch":
+                found.append(f"{where}:{line}: report imports torch; it reads records only")
+            if target.split(".")[0] != source.name:
+                continue
+            stage = stage_of(target, source)
+            if stage is None:
+                found.append(f"{where}:{line}: {target!r} belongs to no stage")
+            elif STAGES.index(stage) > STAGES.index(name):
+                found.append(f"{where}:{line}: {name} imports {target} of the later stage {stage}")
+    return found
+
+
+def imports(path: Path, source: Path) -> Iterator[tuple[int, str]]:
+    """Line and dotted name of all that a module imports, inside functions and type checks too."""
+    package = path.relative_to(source.parent).parent.parts
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join([*above, *filter(None, [node.module])])
+            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args:
+            function, argument = node.func, node.args[0]
+            called = getattr(function, "attr", getattr(function, "id", ""))
+            if called == "import_module" and isinstance(argument, ast.Constant):
+                yield node.lineno, str(argument.value)
+
+
+def stage_of(target: str, source: Path) -> str | None:
+    """The stage that a dotted name is taken from; public names come from the last one."""
+    name = [*target.split("."), "__init__"][1]
+    if name == "__version__":  # it stands in `__init__` and is there before anything is imported
+        return STAGES[0]
+    if name in STAGES:
+        return name
+    is_module = (source / name).is_dir() or (source / f"{name}.py").exists()
+    return None if is_module else "__init__"
+
+
+def test_no_module_imports_from_a_later_stage():
+    assert not faults(SOURCE), "\n" + "\n".join(faults(SOURCE))
+
+
+@pytest.mark.parametrize(
+    ("file", "code", "fault"),
+    [
+        ("errors.py", "from offbeat.files import f", "errors.py:1: errors imports offbeat.files.f"),
+        ("data/thin.py", "import offbeat.models.zoo", "data imports offbeat.models.zoo of the"),
+        ("data/thin.py", "def f():\n    from offbeat.training import fit", "data/thin.py:2: data"),
+        (
+            "solvers/fixed.py",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ..models import zoo",
+            "solvers/fixed.py:3: solvers imports offbeat.models.zoo of the later stage models",
+        ),
+        ("data/__init__.py", "from ..report import page", "of the later stage report"),
+        ("models/zoo.py", "import offbeat", "models imports offbeat of the later stage __init__"),
+        ("models/zoo.py", "from offbeat import fit", "models imports offbeat.fit of the later"),
+        ("models/zoo.py", "from offbeat import cli", "models imports offbeat.cli of the later"),
+        (
+            "models/zoo.py",
+            "import importlib\nimportlib.import_module('offbeat.cli')",
+            "zoo.py:2: models imports offbeat.cli",
+        ),
+        ("stray.py", "", "stray.py: 'stray' belongs to no stage"),
+        ("stray/part.py", "", "stray/part.py: 'stray' belongs to no stage"),
+        ("report/page.py", "import torch.nn", "report/page.py:1: report imports torch"),
+        (
+            "report/page.py",
+            "def f():\n    from torch import nn",
+            "report/page.py:2: report imports",
+        ),
+    ],
+)
+def test_the_check_finds_a_fault(tmp_path, file, code, fault):
+    path = tmp_path / "offbeat" / file
+    path.parent.mkdir(parents=True)
+    path.write_text(code, encoding="utf-8")
+    found = faults(tmp_path / "offbeat")
+    assert len(found) == 1
+    assert fault in found[0]
+
+
+def test_the_check_accepts_imports_along_the_arrow(tmp_path):
+    path = tmp_path / "offbeat" / "models" / "zoo.py"
+    path.parent.mkdir(parents=True)
+    path.write_text(
+        "import torch\n"
+        "from offbeat import __version__, errors\n"
+        "from offbeat.data.batch import Batch\n"
+        "from ..solvers import fixed\n"
+        "from .cell import GRUCell\n",
+        encoding="utf-8",
+    )
+    assert faults(tmp_path / "offbeat") == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import offbeat",
+        "import runpy; sys.argv = ['offbeat', '--help']\n"
+        "try: runpy.run_module('offbeat', run_name='__main__')\n"
+        "except SystemExit as stop: assert not stop.code, stop.code",
+    ],
+    ids=["import offbeat", "offbeat --help"],
+)
+def test_the_front_door_imports_nothing_heavy(code):
+    report = f"print(json.dumps([name for name in {HEAVY} if name in sys.modules]))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import json, sys\n{code}\n{report}"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == []
