@@ -17,6 +17,8 @@ SOUND := $(shell [ -e .venv/.made ] && [ ! -e .venv/.installing ] \
 	&& [ "$$(cat .venv/.made)" = "$(CURDIR)" ] \
 	&& $(BIN)/python -c 'import pip; $(RECENT)' 2>/dev/null && echo yes)
 
+.NOTPARALLEL: # two installs into one environment would meet
+
 .PHONY: help
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 16
@@ -54,8 +56,8 @@ clean: ## remove .venv and everything that was built or cached
 define install
 	@echo "Installing into .venv (some minutes the first time)"
 	@touch .venv/.installing
-	$(BIN)/python -m pip install --quiet torch
-	$(BIN)/python -m pip install --quiet --editable '.[$(1)]'
+	$(BIN)/python -m pip install -qq torch
+	$(BIN)/python -m pip install -qq --editable '.[$(1)]'
 	@rm .venv/.installing
 endef
 

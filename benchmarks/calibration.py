@@ -34,21 +34,6 @@ def protocol_data(
     return train, validation, test, scaler
 
 
-def configs(model: str, epochs: int) -> tuple[ob.ModelConfig, ob.TrainConfig]:
-    """The thesis' model and training, or the anchored model with its own."""
-    if model == "anchored_ode_gru_d":
-        training = ob.TrainConfig(
-            epochs=epochs,
-            optimizer="adam",
-            learning_rate=0.002,
-            schedule="cosine",
-            clip_norm=1.0,
-            loss_scale=100.0,
-        )
-        return ob.ModelConfig(name=model), training
-    return ob.thesis_config(model), ob.TrainConfig(epochs=epochs)
-
-
 def main(
     model: str = "ode_rnn",
     observed_fraction: float = 0.3,
@@ -73,11 +58,12 @@ def main(
     train, validation, test, scaler = protocol_data(
         observed_fraction, n_trajectories=n_trajectories, seed=seed
     )
-    model_config, train_config = configs(model, epochs)
-    made = ob.make(model_config, train, scaler=scaler, seed=seed)
+    thesis = model in ob.THESIS_MODELS
+    config = ob.thesis_config(model) if thesis else ob.ModelConfig(name=model)
+    made = ob.make(config, train, scaler=scaler, seed=seed)
     folder = out / f"{model}-{round(100 * observed_fraction)}-{epochs}"
     started = time.perf_counter()
-    fitted = ob.fit(made, train, validation, train_config, out=folder)
+    fitted = ob.fit(made, train, validation, ob.train_config(model, epochs=epochs), out=folder)
     evaluation = ob.evaluate({model: made}, test)
     print(evaluation.table())
     write_json(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from offbeat.config import ModelConfig, TrainConfig
+from offbeat.config import ModelConfig, PartsConfig, TrainConfig
 from offbeat.errors import (
     DivergenceError,
     FileFormatError,
@@ -16,7 +16,7 @@ from offbeat.errors import (
 
 if TYPE_CHECKING:
     from offbeat.data.batch import Batch, delta, last_values
-    from offbeat.data.prepare import Scaler, split, windows
+    from offbeat.data.prepare import Scaler, parts, split, windows
     from offbeat.data.readers import read
     from offbeat.data.simulate import simulate
     from offbeat.data.store import load, save
@@ -26,13 +26,14 @@ if TYPE_CHECKING:
     from offbeat.inference import predict
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
     from offbeat.models.recurrence import RecurrentModel
-    from offbeat.models.zoo import make, thesis_config
+    from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
     from offbeat.scores import Score, Scores, row_0_constant
     from offbeat.training import FitResult, fit
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "THESIS_MODELS": "models.zoo",
     "Batch": "data.batch",
     "Dataset": "data.trajectory",
     "Evaluation": "evaluation",
@@ -49,6 +50,7 @@ _HOMES = {
     "load": "data.store",
     "load_checkpoint": "models.checkpoint",
     "make": "models.zoo",
+    "parts": "data.prepare",
     "predict": "inference",
     "read": "data.readers",
     "row_0_constant": "scores",
@@ -58,10 +60,12 @@ _HOMES = {
     "split": "data.prepare",
     "thesis_config": "models.zoo",
     "thin": "data.thin",
+    "train_config": "models.zoo",
     "windows": "data.prepare",
 }
 
 __all__ = [
+    "THESIS_MODELS",
     "Batch",
     "Dataset",
     "DivergenceError",
@@ -72,6 +76,7 @@ __all__ = [
     "MissingExtraError",
     "ModelConfig",
     "OffbeatError",
+    "PartsConfig",
     "RecurrentModel",
     "Scaler",
     "Score",
@@ -85,6 +90,7 @@ __all__ = [
     "load",
     "load_checkpoint",
     "make",
+    "parts",
     "predict",
     "read",
     "row_0_constant",
@@ -94,6 +100,7 @@ __all__ = [
     "split",
     "thesis_config",
     "thin",
+    "train_config",
     "windows",
 ]
 

@@ -126,6 +126,27 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
+class PartsConfig:
+    """How recorded trajectories become a training, a validation and a test part.
+
+    Attributes:
+        window: rows of the window cut out of each trajectory, its start drawn; None keeps all.
+        observed_fraction: share of the rows that stay observed; None hides nothing.
+        fractions: shares of training, validation and test trajectories; they sum to 1.
+        seed: of windows, hidden rows and split.
+    """
+
+    window: int | None = None
+    observed_fraction: float | None = None
+    fractions: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "fractions", tuple(self.fractions))
+        _check(self, "window", lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """How a model is trained. The defaults are the thesis' protocol.
 

@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.config import PartsConfig
+from offbeat.data.thin import thin
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
 
@@ -73,6 +75,27 @@ def split(
     return tuple(
         dataset.take(np.sort(order[start:end])) for start, end in zip(starts, ends, strict=True)
     )
+
+
+def parts(dataset: Dataset, config: PartsConfig) -> tuple[Dataset, Dataset, Dataset]:
+    """Windows, hidden rows and split, in this order, all from one seed.
+
+    Args:
+        dataset: as recorded.
+        config: what to do.
+
+    Returns:
+        Training, validation and test part.
+
+    Raises:
+        InputError: as `windows`, `thin` and `split`.
+    """
+    if config.window is not None:
+        dataset = windows(dataset, config.window, seed=config.seed)
+    if config.observed_fraction is not None:
+        dataset = thin(dataset, config.observed_fraction, seed=config.seed)
+    train, validation, test = split(dataset, config.fractions, seed=config.seed)
+    return train, validation, test
 
 
 @dataclass(frozen=True, eq=False)

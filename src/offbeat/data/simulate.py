@@ -58,15 +58,16 @@ def simulate(
     n_trajectories = _at_least("n_trajectories", n_trajectories, 1)
     rows = _at_least("rows", rows, 2)
     threads = available_cores() if threads is None else _at_least("threads", threads, 1)
+    random = _random_state(seed)
     model = load_model(robot)
     if initial_states is None:
-        states = entry.draw(_random_state(seed), model, n_trajectories)
+        states = entry.draw(random, model, n_trajectories)
     else:
         states = _given_states(initial_states, model)
     values = _roll_out(robot, model, states, rows, threads, progress)
     names, units = channels_of(model)
     timestep = float(model.opt.timestep)
-    times = np.arange(rows) * timestep
+    times = np.arange(rows, dtype=np.float64) * timestep
     return Dataset(
         tuple(
             Trajectory(times, value, names=names, units=units, origin=f"{robot} {i}")
@@ -77,10 +78,7 @@ def simulate(
             "seed": None if initial_states is not None else int(seed),
             "timestep_s": timestep,
             "control": "zero",
-            "versions": {
-                package: _version(package)
-                for package in ("offbeat", "mujoco", "dm_control", "numpy")
-            },
+            "versions": _versions(),
         },
     )
 
@@ -168,7 +166,7 @@ def _random_state(seed: int) -> np.random.RandomState:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
         raise InputError(f"seed must be an integer from 0 to {2**32 - 1}, got {seed!r}")
     # The legacy generator: its stream is frozen, and the protocol's draw is defined by it.
-    return np.random.RandomState(int(seed))  # noqa: NPY002
+    return np.random.RandomState(int(seed))
 
 
 def _given_states(initial_states: ArrayLike, model: Any) -> NDArray[np.float64]:
@@ -191,8 +189,8 @@ def _given_states(initial_states: ArrayLike, model: Any) -> NDArray[np.float64]:
     return states
 
 
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"  # run from a source tree
+def _versions() -> dict[str, str]:
+    from offbeat import __version__  # late: the package's front page imports this module
+
+    packages = ("mujoco", "dm_control", "numpy")
+    return {"offbeat": __version__} | {name: importlib.metadata.version(name) for name in packages}

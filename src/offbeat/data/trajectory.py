@@ -259,6 +259,25 @@ class Dataset(Sequence[Trajectory]):
         """The trajectories at these positions, in this order."""
         return replace(self, trajectories=tuple(self.trajectories[int(i)] for i in index))
 
+    def select(self, names: Sequence[str]) -> Dataset:
+        """These channels, in this order.
+
+        Raises:
+            InputError: a name is not among the channels.
+        """
+        order = [self.names.index(one_of("channel", name, self.names)) for name in names]
+        chosen = (
+            replace(
+                t,
+                values=t.values[:, order],
+                observed=t.observed[:, order],
+                names=tuple(t.names[i] for i in order),
+                units=tuple(t.units[i] for i in order),
+            )
+            for t in self
+        )
+        return replace(self, trajectories=tuple(chosen))
+
     def __repr__(self) -> str:
         rows = sum(t.rows for t in self)
         share = sum(int(t.observed.sum()) for t in self) / (rows * self.channels)

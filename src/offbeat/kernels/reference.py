@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +20,7 @@ from offbeat.kernels.spec import (
     ScanSpec,
     ScanWeights,
 )
-from offbeat.solvers import solve, tableau
+from offbeat.solvers import Field, solve, tableau
 
 def scan(
     spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor
@@ -38,7 +39,7 @@ def scan(
     """
     before: list[Tensor] = []
     after: list[Tensor] = []
-    decays = _unbind_decay(rows.decay, len(rows.gap))
+    decays = _decays(spec, rows)
     gates, updates, gaps = rows.gates.unbind(), rows.update.unbind(), rows.gap.unbind()
     for i, (gap, gate, update, decay) in enumerate(zip(gaps, gates, updates, decays, strict=True)):
         if rows.fed and rows.fed[i]:
@@ -64,14 +65,28 @@ def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
     return x
 
 
-def _unbind_decay(
-    decay: DecayRows | None, rows: int
-) -> Sequence[tuple[Tensor, Tensor, Tensor] | None]:
-    if decay is None:
-        return [None] * rows
-    return list(
-        zip(decay.start.unbind(), decay.end.unbind(), decay.applied.unbind(), strict=True)
-    )
+Decay = Tensor | tuple[Tensor, Tensor, Tensor] | None
+"""Of one row: the factor of h, or (start, end, applied) where it acts step by step, or nothing."""
+
+
+def decay_factors(spec: ScanSpec, rows: ScanRows) -> Tensor | None:
+    """(rows, batch, hidden) what h is multiplied by at each row, for a decay that acts at once."""
+    if rows.decay is None:
+        return None
+    if not spec.has_field:
+        return torch.exp(rows.decay.applied - _exponent(rows.decay.end))
+    return torch.exp(-_growth(rows.decay.end, rows.decay.applied))
+
+
+def _decays(spec: ScanSpec, rows: ScanRows) -> Sequence[Decay]:
+    """The decay of each row; where it acts at once, the factors of all rows in one go."""
+    if rows.decay is None:
+        return [None] * len(rows.gap)
+    several_steps = spec.steps_per_gap > 1 or spec.max_step is not None
+    if spec.has_field and (several_steps or tableau(spec.solver).adaptive):
+        parts = (rows.decay.start, rows.decay.end, rows.decay.applied)
+        return list(zip(*(part.unbind() for part in parts), strict=True))
+    return cast(Tensor, decay_factors(spec, rows)).unbind()
 
 
 def _fed_gate(
@@ -88,89 +103,129 @@ def _fed_gate(
 
 
 def _carry(
+    spec: ScanSpec, weights: ScanWeights, gap: Tensor, decay: Decay, state: Tensor
+) -> Tensor:
+    """Decay and flow of (x, h) over one gap; the memory of an LSTM stays."""
+    if isinstance(decay, Tensor):
+        state = _scale_hidden(spec, state, decay)
+        decay = None
+    if not spec.has_field:
+        return state
+    driven = spec.anchored + spec.hidden_size
+    memory = state[:, driven:]
+    state = state[:, :driven]
+    state = _flow(spec, weights, gap, decay, state)
+    return torch.cat([state, memory], dim=1) if memory.shape[1] else state
+
+
+def _flow(
     spec: ScanSpec,
     weights: ScanWeights,
     gap: Tensor,
     decay: tuple[Tensor, Tensor, Tensor] | None,
     state: Tensor,
 ) -> Tensor:
-    """Decay and flow of (x, h) over one gap; the memory of an LSTM stays."""
-    if not spec.has_field:
-        if decay is None:
-            return state
-        _, end, applied = decay
-        return _damp(spec, state, _exponent(end) - applied)
-    driven = spec.anchored + spec.hidden_size
-    memory = state[:, driven:]
-    state = state[:, :driven]
-
     def field(_: Tensor, y: Tensor) -> Tensor:
         return perceptron(weights.field, y, spec.activation)
 
+    scheme = tableau(spec.solver)
     parameters = [p for layer in weights.field for p in layer] if spec.adjoint else None
-    if tableau(spec.solver).adaptive:
-        state = _flow_adaptive(spec, field, parameters, gap, decay, state)
-    else:
-        state = _flow_fixed(spec, field, parameters, gap, decay, state)
-    return torch.cat([state, memory], dim=1) if memory.shape[1] else state
+    if scheme.adaptive and decay is not None:
+        return _flow_damped(spec, field, parameters, gap, decay, state)
+    steps: int | Tensor = spec.steps_per_gap
+    if spec.max_step is not None:
+        steps = torch.ceil(gap / spec.max_step - 1e-6).clamp_min(spec.steps_per_gap).long()
+    if decay is not None:
+        return _flow_split(spec, field, parameters, gap, decay, state, steps)
+    return solve(
+        field,
+        state,
+        gap,
+        scheme,
+        steps=steps,
+        rtol=spec.rtol,
+        atol=spec.atol,
+        adjoint_parameters=parameters,
+    )
 
 
-def _flow_fixed(spec, field, parameters, gap, decay, state):  # type: ignore[no-untyped-def]
+def _flow_split(
+    spec: ScanSpec,
+    field: Field,
+    parameters: Sequence[Tensor] | None,
+    gap: Tensor,
+    decay: tuple[Tensor, Tensor, Tensor],
+    state: Tensor,
+    steps: int | Tensor,
+) -> Tensor:
     """Equal steps; the decay of each step comes before it (Lie splitting).
 
     With one step per gap and every row observed this is algorithm 3 of the thesis.
     """
-    scheme = tableau(spec.solver)
-    steps: int | Tensor = spec.steps_per_gap
-    if spec.max_step is not None:
-        steps = torch.ceil(gap / spec.max_step - 1e-6).clamp_min(spec.steps_per_gap).long()
-    if decay is None:
-        return solve(field, state, gap, scheme, steps=steps, adjoint_parameters=parameters)
     start, end, applied = decay
     most = steps if isinstance(steps, int) else int(steps.max())
     for k in range(1, most + 1):
         share = k / steps if isinstance(steps, int) else (k / steps).clamp_max(1.0).to(gap.dtype)
-        reached = _exponent(end if most == 1 else start + share * (end - start))
-        # Only ever downwards: a state that the flow has meanwhile moved is not blown up again.
-        state = _damp(spec, state, (reached - applied).clamp_min(0))
-        applied = torch.maximum(applied, reached)
+        reached = start + share * (end - start)
+        state = _scale_hidden(spec, state, torch.exp(-_growth(reached, applied)))
+        applied = torch.maximum(applied, _exponent(reached))
         step = gap / steps
         if not isinstance(steps, int):
             step = torch.where(k <= steps, step, torch.zeros_like(step))
-        state = solve(field, state, step, scheme, adjoint_parameters=parameters)
+        state = solve(field, state, step, tableau(spec.solver), adjoint_parameters=parameters)
     return state
 
 
-def _flow_adaptive(spec, field, parameters, gap, decay, state):  # type: ignore[no-untyped-def]
-    """The limit of ever shorter split steps: h = exp(-E(s)) u, solved for u."""
-    options = {"rtol": spec.rtol, "atol": spec.atol}
-    scheme = tableau(spec.solver)
-    if decay is None:
-        return solve(field, state, gap, scheme, adjoint_parameters=parameters, **options)
+def _flow_damped(
+    spec: ScanSpec,
+    field: Field,
+    parameters: Sequence[Tensor] | None,
+    gap: Tensor,
+    decay: tuple[Tensor, Tensor, Tensor],
+    state: Tensor,
+) -> Tensor:
+    """The limit of ever shorter split steps, adaptive: h = exp(-E(s)) u, solved for u."""
     start, end, applied = decay
     at_start = _exponent(start)
-    state = _damp(spec, state, (at_start - applied).clamp_min(0))
+    state = _scale_hidden(spec, state, torch.exp(-_growth(start, applied)))
 
     def exponent(s: Tensor) -> Tensor:
-        return (_exponent(start + s * (end - start)) - at_start).clamp_min(0)
+        return _growth(start + s * (end - start), at_start)
 
     def damped_field(s: Tensor, u: Tensor) -> Tensor:
         grown = exponent(s)
-        return _damp(spec, field(s, _damp(spec, u, grown)), -grown)
+        h = _scale_hidden(spec, u, torch.exp(-grown))
+        return _scale_hidden(spec, field(s, h), torch.exp(grown))
 
     if parameters is not None:
         parameters = [*parameters, start, end]
-    state = solve(damped_field, state, gap, scheme, adjoint_parameters=parameters, **options)
-    return _damp(spec, state, exponent(torch.ones_like(gap)))
+    u = solve(
+        damped_field,
+        state,
+        gap,
+        tableau(spec.solver),
+        rtol=spec.rtol,
+        atol=spec.atol,
+        adjoint_parameters=parameters,
+    )
+    return _scale_hidden(spec, u, torch.exp(-exponent(torch.ones_like(gap))))
 
 
 def _exponent(a: Tensor) -> Tensor:
+    """A of `DecayRows`, bounded."""
     return a.clamp(0, LARGEST_EXPONENT)
 
 
-def _damp(spec: ScanSpec, state: Tensor, exponent: Tensor) -> Tensor:
-    """Multiplies h by exp(-exponent), and leaves x and c."""
-    factor = torch.exp(-exponent)
+def _growth(a: Tensor, applied: Tensor) -> Tensor:
+    """How far A has grown past what the state carries; never less than 0.
+
+    A decay only ever shrinks: a state that the flow has meanwhile moved is not blown up again.
+    """
+    return (_exponent(a) - applied).clamp_min(0)
+
+
+def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
+    """Multiplies h, and leaves x and c."""
     if factor.shape == state.shape:
         return state * factor
     first, last = spec.anchored, spec.anchored + spec.hidden_size

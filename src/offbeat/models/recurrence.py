@@ -138,17 +138,23 @@ class RecurrentModel(nn.Module):
         return self.cell.inputs.dtype
 
     def batch(self, dataset: Dataset) -> Batch:
-        """Scales and pads a data set of this model's channels.
+        """Scales and pads a data set of this model's channels, in any order.
 
         Raises:
-            InputError: channel names or units differ from the model's.
+            InputError: channels differ from the model's, or their units where the data has any.
         """
-        if dataset.names != self.names or dataset.units != self.units:
+        own = dict(zip(self.names, self.units, strict=True))
+        given = dict(zip(dataset.names, dataset.units, strict=True))
+        agree = own.keys() == given.keys() and all(
+            unit in ("", own[name]) or not own[name] for name, unit in given.items()
+        )
+        if not agree:
             raise InputError(
-                f"the data has channels {_pairs(dataset.names, dataset.units)}; the model was "
-                f"made for {_pairs(self.names, self.units)}; give it the same channels in the "
-                "same order"
+                f"the data has channels {_pairs(given)}; the model was made for {_pairs(own)}; "
+                "give it the channels it was made for"
             )
+        if dataset.names != self.names:
+            dataset = dataset.select(self.names)
         return Batch.of(dataset, scaler=self.scaler, dtype=self.dtype)
 
     def empty_carry(self, batch: int, *, coins: torch.Generator | None = None) -> Carry:
@@ -309,5 +315,5 @@ def _check(config: ModelConfig) -> None:
         raise InputError("an anchored state holds the channels: leave input_decay off")
 
 
-def _pairs(names: tuple[str, ...], units: tuple[str, ...]) -> str:
-    return ", ".join(f"{n} [{u}]" for n, u in zip(names, units, strict=True))
+def _pairs(channels: dict[str, str]) -> str:
+    return ", ".join(f"{name} [{unit}]" for name, unit in channels.items())

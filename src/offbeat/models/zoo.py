@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
-from offbeat.config import ModelConfig
+from offbeat.config import ModelConfig, TrainConfig, from_mapping
 from offbeat.data.batch import Batch
 from offbeat.data.prepare import Scaler, ScalerKind, check_observed
 from offbeat.data.trajectory import Dataset
@@ -101,6 +101,32 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
     if name == "gru":
         protocol["age_input"] = "gap"
     return ModelConfig(name=name, **{**protocol, **options})
+
+
+def train_config(name: str, **options: Any) -> TrainConfig:
+    """The training that a model was measured with: the thesis' own, unless stated otherwise.
+
+    The anchored model trains with Adam, cosine decay and clipped gradients, which it needs: its
+    state holds the prediction itself, so one bad step is seen by all that follow.
+
+    Args:
+        name: id of the zoo's entry.
+        **options: fields of `TrainConfig`, `epochs` above all.
+
+    Raises:
+        InputError: the zoo has no such entry, or an option is out of its range.
+    """
+    one_of("model", name, ZOO)
+    own: dict[str, Any] = {}
+    if ZOO[name].get("anchored"):
+        own = {
+            "optimizer": "adam",
+            "learning_rate": 0.002,
+            "schedule": "cosine",
+            "clip_norm": 1.0,
+            "loss_scale": 100.0,
+        }
+    return from_mapping(TrainConfig, {**own, **options})
 
 
 def make(

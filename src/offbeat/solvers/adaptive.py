@@ -12,10 +12,13 @@ from offbeat.solvers.fixed import Field, Steps, check_problem, runge_kutta_step,
 from offbeat.solvers.tableau import TABLEAUS, Tableau
 
 MAX_STEPS = 10_000
+"""Steps that are tried for a gap, refused ones included, before a solver gives up."""
 
 _SAFETY = 0.9
 _SHRINK, _GROW = 0.2, 10.0
-_LEAST_ERROR = 1e-4
+_LEAST_ERROR = 1e-10
+_LEAST_PREVIOUS = 1e-4
+"""Errors below these count as these, so that one lucky step doesn't upset the controller."""
 _SNAP = 1e-2
 """A step that would leave less than this share of itself takes the rest of the gap along."""
 
@@ -102,6 +105,7 @@ def adaptive_steps(
     gap = duration.detach()
     s, end = torch.zeros_like(gap), torch.ones_like(gap)
     h = active.to(gap)
+    least = torch.finfo(gap.dtype).eps ** 2
     controller = _Controller(gap, tableau.order)
     first: Tensor | None = None
     for tried in range(1, max_steps + 1):
@@ -131,10 +135,13 @@ def adaptive_steps(
         end = torch.where(end + _SNAP * size >= 1, 1.0, end)
         # The difference is exact, so that the steps of a row sum to its gap to the last bit.
         h = torch.where(active, end - s, 0.0)
-        stuck = active & ~(h > 0)
-        if tried == max_steps or bool(stuck.any()):
-            lost = active if tried == max_steps else stuck
-            raise _divergence(field, y, gap, s, int(lost.int().argmax()), tried, tableau)
+        # A slope that is not finite where the row stands stays so however small the step.
+        finite = (slopes[0] * gap).isfinite().all(dim=1, keepdim=True)
+        stuck = active & ~(finite & (h > least))
+        if bool(stuck.any()):
+            why = "even the smallest step misses the tolerance: the vector field jumps or overflows"
+            raise _divergence(field, y, gap, s, stuck, tried, tableau, why)
+    raise _divergence(field, y, gap, s, active, max_steps, tableau, "the tolerance asks for more")
 
 
 class _Controller:
@@ -146,7 +153,7 @@ class _Controller:
     """
 
     def __init__(self, gap: Tensor, order: int) -> None:
-        self._previous = torch.full_like(gap, _LEAST_ERROR)
+        self._previous = torch.full_like(gap, _LEAST_PREVIOUS)
         self._grow = torch.full_like(gap, _GROW)
         self._order = order
 
@@ -158,7 +165,7 @@ class _Controller:
         again = error ** (-1 / self._order)
         factor = _SAFETY * torch.where(accepted, onward, again)
         factor = factor.clamp(min=_SHRINK).minimum(self._grow)
-        self._previous = torch.where(accepted, error, self._previous)
+        self._previous = torch.where(accepted, error, self._previous).clamp(min=_LEAST_PREVIOUS)
         self._grow = torch.where(accepted, _GROW, 1.0)  # no growth right after a refusal
         return h * factor
 
@@ -195,8 +202,16 @@ def _check(tableau: Tableau, rtol: float, atol: float) -> None:
 
 @torch.no_grad()
 def _divergence(
-    field: Field, y: Tensor, gap: Tensor, s: Tensor, row: int, tried: int, tableau: Tableau
+    field: Field,
+    y: Tensor,
+    gap: Tensor,
+    s: Tensor,
+    rows: Tensor,
+    tried: int,
+    tableau: Tableau,
+    why: str,
 ) -> DivergenceError:
+    row = int(rows.int().argmax())
     where = (
         f"{tableau.name} stopped in row {row} after {tried} steps, {100 * float(s[row]):.3g} % "
         f"into its gap of {float(gap[row]):.6g}"
@@ -208,6 +223,5 @@ def _divergence(
                 "weights that have grown too large"
             )
     return DivergenceError(
-        f"{where}: the tolerance asks for more or smaller steps than there are; use a looser "
-        "tolerance, a shorter longest gap, or a solver of fixed steps"
+        f"{where}: {why}; use a looser tolerance, a shorter longest gap, or a solver of fixed steps"
     )

@@ -60,8 +60,7 @@ def solve_adjoint(
         (batch, size) states at the end of the gaps.
 
     Raises:
-        DivergenceError: as the solver, on the way there or back, or the gradient that comes in is
-            not finite.
+        DivergenceError: an adaptive solver could not keep the tolerance, on the way there or back.
 
     References:
         Chen et al., Neural Ordinary Differential Equations, NeurIPS 2018;

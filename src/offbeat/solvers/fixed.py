@@ -42,6 +42,7 @@ def solve_fixed(
         InputError: shapes or types disagree, or there are fewer steps than one.
     """
     check_problem(y, duration)
+    steps = _shared(steps, duration)
     if tableau.stages == 1 and isinstance(steps, int) and steps == 1:
         # Nearly every step of training is this one, so it must cost no more than the field.
         return torch.addcmul(y, duration, field(torch.zeros_like(duration), y))
@@ -142,39 +143,39 @@ def check_problem(y: Tensor, duration: Tensor) -> None:
 
 def _grid(duration: Tensor, steps: int | Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
     """Yields (batch, 1) start and length of each step, and which rows move (None: all)."""
-    fewest, most = _bounds(steps, duration)
+    steps = _shared(steps, duration)
     s = torch.zeros_like(duration)
     # Lengths are differences of the ends, so that s + h is the end to the last bit.
-    if isinstance(steps, int) or fewest == most:
-        for i in range(most):
-            end = torch.full_like(duration, (i + 1) / most)
+    if isinstance(steps, int):
+        for i in range(steps):
+            end = torch.full_like(duration, (i + 1) / steps)
             yield s, end - s, None
             s = end
         return
     counts = steps.to(duration)
-    for i in range(most):
+    for i in range(int(steps.max())):
         end = counts.clamp(max=i + 1) / counts
         yield s, end - s, end > s
         s = end
 
 
-def _bounds(steps: int | Tensor, duration: Tensor) -> tuple[int, int]:
-    """Returns the smallest and the largest number of steps of a row, after checking them."""
+def _shared(steps: int | Tensor, duration: Tensor) -> int | Tensor:
+    """Returns the number of steps that all rows share, or `steps` as it is, after checking it."""
     if isinstance(steps, int):
         if steps < 1:
             raise InputError(f"steps is {steps}, expected 1 or more")
-        return steps, steps
+        return steps
     if steps.shape != duration.shape or steps.is_floating_point() or steps.is_complex():
         raise InputError(
             f"steps is {steps.dtype} of shape {tuple(steps.shape)}, expected a number or integers "
             f"of shape {tuple(duration.shape)}, one per row"
         )
     if steps.numel() == 0:
-        return 0, 0
+        return 1
     fewest, most = (int(bound) for bound in torch.aminmax(steps))
     if fewest < 1:
         raise InputError(
             f"steps is {fewest} for row {int(steps.argmin())}, expected 1 or more, also where the "
             "gap is 0; use steps.clamp(min=1)"
         )
-    return fewest, most
+    return most if fewest == most else steps

@@ -17,10 +17,6 @@ from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
 
 
-def _always(path: Path) -> bool:
-    return True
-
-
 @dataclass(frozen=True)
 class Reader:
     """A file format that can be read.
@@ -30,13 +26,14 @@ class Reader:
         suffixes: file name suffixes, in lower case, each with its dot.
         function: reads a file; its keyword arguments are the options of the format.
         recognises: looks into a file and says whether it is of this format, for formats that share
-            a suffix with another one; by default the suffix is enough.
+            a suffix with another one. None where the suffix is enough; such a reader gets what no
+            other one recognises.
     """
 
     name: str
     suffixes: tuple[str, ...]
     function: Callable[..., Dataset]
-    recognises: Callable[[Path], bool] = _always
+    recognises: Callable[[Path], bool] | None = None
 
     @property
     def options(self) -> list[str]:
@@ -99,8 +96,11 @@ def _reader_of(path: Path) -> Reader:
             f"{path} has the unknown suffix {suffix!r}, expected one of: {', '.join(known)}; "
             "rename it, or name its format with format="
         )
-    # One that stands alone says best itself what is wrong with the file.
-    return next((reader for reader in fitting if reader.recognises(path)), fitting[0])
+    for reader in fitting:
+        if reader.recognises is not None and reader.recognises(path):
+            return reader
+    # Nobody's file: a reader of that suffix says best what is wrong with it.
+    return next((reader for reader in fitting if reader.recognises is None), fitting[0])
 
 
 register(Reader("offbeat", (".parquet",), store.load, store.holds_data_set))

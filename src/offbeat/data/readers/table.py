@@ -62,8 +62,10 @@ def read_csv(
             cell is not a number, or times do not increase.
         InputError: an option names a column or a unit that there is not.
     """
-    if len(delimiter) != 1:
-        raise InputError(f"delimiter must be one character, got {delimiter!r}")
+    if len(delimiter) != 1 or not delimiter.isascii() or delimiter in '"\r\n':
+        raise InputError(
+            f"delimiter must be one ASCII character, no quote or line end, got {delimiter!r}"
+        )
     file = _CsvFile(require_file(path), delimiter)
     header = file.header()
     time = _column("time_column", time_column, TIME_COLUMNS, header)

@@ -1,0 +1,183 @@
+"""What stands in the metadata of a stored data set: whatever the columns of its table don't say."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import FileFormatError, InputError
+
+SCHEMA_VERSION = 1
+"""Counted up when files are written that an earlier version of this module would misread."""
+
+METADATA_KEY = b"offbeat"
+"""The key of the schema, which is JSON, in the metadata of a Parquet file."""
+
+CHECKSUM_KEY = b"offbeat_crc32"
+"""The key of its checksum, in decimal: Parquet has checksums for data, and none for metadata."""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """The columns of a stored data set, its counts, and what travels with it.
+
+    Args:
+        version: of the schema.
+        rows: rows of all trajectories together.
+        trajectories: their number.
+        names: one per channel.
+        units: one per channel.
+        observed: the channels in which observed and known differ, which have a column of their own.
+        actions: their number, or None where trajectories have none.
+        origins: one per trajectory.
+        meta: of the data set.
+    """
+
+    version: int
+    rows: int
+    trajectories: int
+    names: list[str]
+    units: list[str]
+    observed: list[str]
+    actions: int | None
+    origins: list[str]
+    meta: dict[str, Any]
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> Schema:
+        """The schema of a data set that is to be written.
+
+        Raises:
+            InputError: a channel has the name of another column, or trajectories differ in the
+                number of their actions.
+        """
+        counts = [None if t.actions is None else t.actions.shape[1] for t in dataset]
+        if len(set(counts)) > 1:
+            other = next(i for i, count in enumerate(counts) if count != counts[0])
+            raise InputError(
+                f"trajectory {other} has {counts[other] or 'no'} actions, the first one has "
+                f"{counts[0] or 'no'}; a file holds trajectories of the same actions"
+            )
+        differs = np.zeros(dataset.channels, dtype=bool)
+        for t in dataset:
+            differs |= (t.observed != t.known).any(axis=0)
+        schema = cls(
+            version=SCHEMA_VERSION,
+            rows=sum(t.rows for t in dataset),
+            trajectories=len(dataset),
+            names=list(dataset.names),
+            units=list(dataset.units),
+            observed=[name for name, yes in zip(dataset.names, differs, strict=True) if yes],
+            actions=counts[0],
+            origins=[t.origin for t in dataset],
+            meta=dict(dataset.meta),
+        )
+        columns = schema.columns
+        if len(set(columns)) < len(columns):
+            twice = next(name for name in columns if columns.count(name) > 1)
+            raise InputError(
+                f"a channel is called {twice!r}, which the file needs for a column of its own; "
+                "rename the channel"
+            )
+        return schema
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[bytes, bytes] | None, path: Path) -> Schema:
+        """The schema of a file.
+
+        Raises:
+            FileFormatError: there is none, it is damaged, or of a later version.
+        """
+        metadata = metadata or {}
+        text = metadata.get(METADATA_KEY)
+        if text is None:
+            raise FileFormatError(
+                f"{path} is Parquet, but no data set of Offbeat (no key {METADATA_KEY.decode()!r} "
+                "in its metadata); make one with Trajectory.from_arrays, Dataset and save"
+            )
+        try:
+            if metadata.get(CHECKSUM_KEY, _checksum(text)) != _checksum(text):
+                raise ValueError("its checksum does not match")
+            fields = dict(json.loads(text))
+            version = fields["version"]
+            schema = None if version > SCHEMA_VERSION else cls(**fields)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(
+                f"{path} has a damaged schema in its metadata ({type(error).__name__}: {error}); "
+                "copy it again, or write it with save"
+            ) from None
+        if schema is None:
+            raise FileFormatError(
+                f"{path} has version {version} of the schema, this Offbeat reads up to "
+                f"{SCHEMA_VERSION}; install a later one with: pip install --upgrade offbeat"
+            )
+        return schema
+
+    def to_metadata(self) -> dict[bytes, bytes]:
+        """What `from_metadata` reads.
+
+        Raises:
+            InputError: `meta` would not come back as it is.
+        """
+        try:
+            text = json.dumps(asdict(self), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"meta of a data set must be JSON-like to be saved ({error}); "
+                "keep to strings, finite numbers, booleans, None, lists and dicts"
+            ) from None
+        if json.loads(text)["meta"] != self.meta:
+            raise InputError(
+                "meta of a data set would not come back from a file as it is; "
+                "use lists, not tuples, and strings as keys"
+            )
+        return {METADATA_KEY: text.encode(), CHECKSUM_KEY: _checksum(text.encode())}
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of all columns, in order."""
+        return ["trajectory", "time", *self.names, *self.observed_columns, *self.action_columns]
+
+    @property
+    def observed_columns(self) -> list[str]:
+        """Names of the columns that say what may be looked at, in the order of `observed`."""
+        return [f"{name}|observed" for name in self.observed]
+
+    @property
+    def action_columns(self) -> list[str]:
+        """Names of the columns of actions."""
+        return [f"action|{i}" for i in range(self.actions or 0)]
+
+    def to_arrow(self) -> Any:
+        """The columns with their types, as a `pyarrow.Schema`."""
+        import pyarrow as pa
+
+        types = {"trajectory": pa.int32()} | dict.fromkeys(self.observed_columns, pa.bool_())
+        return pa.schema([pa.field(name, types.get(name, pa.float64())) for name in self.columns])
+
+    def check_columns(self, arrow: Any, path: Path) -> None:
+        """Compares with the columns that a file has, a `pyarrow.Schema`.
+
+        Raises:
+            FileFormatError: names, types or order differ.
+        """
+        expected = [f"{field.name} ({field.type})" for field in self.to_arrow()]
+        got = [f"{field.name} ({field.type})" for field in arrow]
+        if got != expected:
+            missing = ", ".join(sorted(set(expected) - set(got))) or "none"
+            unexpected = ", ".join(sorted(set(got) - set(expected))) or "none"
+            raise FileFormatError(
+                f"{path} has other columns than its schema says: missing {missing}, unexpected "
+                f"{unexpected}; it was changed after it was written, write it with save"
+            )
+
+
+def _checksum(text: bytes) -> bytes:
+    return str(zlib.crc32(text)).encode()

@@ -1,0 +1,429 @@
+"""The demo: from simulation to a compared result in minutes, with everything it shows on disk."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from offbeat.config import TrainConfig
+from offbeat.data.prepare import Scaler, split, windows
+from offbeat.data.simulate import available_cores, simulate
+from offbeat.data.store import load, save
+from offbeat.data.thin import thin
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.errors import InputError, MissingExtraError, OffbeatError
+from offbeat.evaluation import LAST_VALUE, Evaluation, evaluate
+from offbeat.files import write_json, write_text
+from offbeat.inference import predict
+from offbeat.models.checkpoint import load_checkpoint
+from offbeat.models.recurrence import RecurrentModel
+from offbeat.models.zoo import THESIS_MODELS, make, train_config
+from offbeat.report import figures
+from offbeat.report.animation import side_by_side
+from offbeat.report.style import style_of
+from offbeat.scores import SCORINGS
+from offbeat.training import EpochRecord, fit
+
+ROBOT = "hopper"
+OBSERVED_FRACTION = 0.3
+ROWS = 100
+ANCHORED = "anchored_ode_gru_d"
+_PARTS = ("train", "validation", "test")
+CHANNELS = ("rootz_qpos", "rooty_qpos", "knee_qpos", "knee_qvel")
+"""Channels of the figure: height and pitch of the torso, angle and speed of the knee."""
+
+PROTOCOL_SEED = 123  # of the initial states, as in the protocol
+FULL_STEPS = {**dict.fromkeys(THESIS_MODELS, 7000), ANCHORED: 2100}
+"""Steps of a full-size run: 7,000 trajectories, batches of 50, 50 epochs or 15."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """How one model was trained in the demo.
+
+    Attributes:
+        history: one record per epoch.
+        full_steps: optimizer steps of a full-size run.
+    """
+
+    history: tuple[EpochRecord, ...]
+    full_steps: int
+
+    @property
+    def steps(self) -> int:
+        """Optimizer steps done."""
+        return self.history[-1].steps
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the training, s."""
+        return sum(record.seconds for record in self.history)
+
+    @property
+    def under_trained(self) -> bool:
+        """True if it took fewer steps than a full-size run."""
+        return self.steps < self.full_steps
+
+    def note(self) -> str:
+        """For the end of a line of the table."""
+        took = f"{self.steps} of {self.full_steps} steps, {self.seconds:.0f} s"
+        return f"under-trained: {took}" if self.under_trained else took
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo found and wrote; as text, its report.
+
+    Attributes:
+        folder: where everything lies.
+        evaluation: every model and the last-value predictor on the test part.
+        trainings: by model.
+        written: files and folders, relative to `folder`, each with what it holds.
+        messages: what could not be done, and why.
+        seconds: wall time of this call.
+    """
+
+    folder: Path
+    evaluation: Evaluation
+    trainings: Mapping[str, Training]
+    written: Mapping[str, str]
+    messages: tuple[str, ...]
+    seconds: float
+
+    def __str__(self) -> str:
+        notes = {name: training.note() for name, training in self.trainings.items()}
+        width = max(map(len, self.written))
+        run, data = self.folder / "models" / ANCHORED, self.folder / "data" / "test.parquet"
+        lines = [
+            f"One-step-ahead prediction of {self.evaluation.trajectories} {ROBOT} trajectories of "
+            f"the test part, {100 * OBSERVED_FRACTION:.0f} % of the rows observed.",
+            "Errors are in the units of the thesis: (x - min) / max per channel, over all data.",
+            "",
+            self.evaluation.table(notes={**notes, LAST_VALUE: "nothing to train"}),
+            "",
+            "Models marked as under-trained were stopped early to keep the demo short: the table "
+            "does not rank them.",
+            *self.messages,
+            "",
+            f"Written to {self.folder} in {self.seconds:.0f} s:",
+            *(f"  {name.ljust(width)}  {about}" for name, about in self.written.items()),
+            "",
+            f"Next: offbeat evaluate {run} {data}",
+        ]
+        return "\n".join(lines)
+
+
+def run_demo(
+    out: str | Path = "runs/demo",
+    *,
+    seed: int = 0,
+    n_trajectories: int = 4000,
+    epochs: int = 5,
+    anchored_epochs: int = 12,
+    workers: int | None = None,
+    progress: bool = True,
+) -> DemoResult:
+    """Simulates a hopper, hides rows, trains five models, scores them, and shows the result.
+
+    Training stops long before the models of the thesis are done; the result says so. A demo that
+    was stopped goes on where it was. Results do not depend on `workers`.
+
+    Args:
+        out: folder to write to.
+        seed: of windows, hidden rows, split, weights and batches.
+        n_trajectories: to simulate; 70 % of them are trained on.
+        epochs: of the models of the thesis.
+        anchored_epochs: of the anchored model.
+        workers: models trained side by side, each in a process with one thread; by default 2, or
+            1 where there is one core. With 1, this process trains.
+        progress: show progress bars on standard error.
+
+    Returns:
+        What was found and written; `print` it.
+
+    Raises:
+        InputError: an argument is out of bounds, or `out` holds a demo with other settings.
+        MissingExtraError: mujoco or dm_control is not installed.
+    """
+    started = time.perf_counter()
+    out = Path(out)
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1, got {workers}")
+    if workers is None:
+        workers = min(2, available_cores())
+    settings = {
+        "robot": ROBOT,
+        "observed_fraction": OBSERVED_FRACTION,
+        "seed": seed,
+        "n_trajectories": n_trajectories,
+        "epochs": epochs,
+        "anchored_epochs": anchored_epochs,
+    }
+    # The longest first, so that two workers end at about the same time.
+    configs = {
+        name: train_config(name, epochs=anchored_epochs if name == ANCHORED else epochs, seed=seed)
+        for name in (ANCHORED, *reversed(THESIS_MODELS))
+    }
+    _check_folder(out, settings)
+    recorded = simulate(ROBOT, n_trajectories, 2 * ROWS, seed=PROTOCOL_SEED, progress=progress)
+    scaler = Scaler.fit("divide_by_max", recorded)
+    thinned = thin(windows(recorded, ROWS, seed=seed), OBSERVED_FRACTION, seed=seed)
+    parts = dict(zip(_PARTS, split(thinned, seed=seed), strict=True))
+    write_json(out / "settings.json", settings)
+    for name, part in parts.items():
+        save(part, out / "data" / f"{name}.parquet")
+    jobs = {name: _Job(name, config, scaler, out) for name, config in configs.items()}
+    _train(list(jobs.values()), workers, progress)
+    trainings = {name: Training(jobs[name].history(), full) for name, full in FULL_STEPS.items()}
+    with _one_thread():
+        models = {name: load_checkpoint(jobs[name].folder) for name in FULL_STEPS}
+        evaluation = evaluate(models, parts["test"], seed=seed)
+        _write_scores(out, evaluation, trainings)
+        _draw(out, models, parts, trainings)
+        messages = _animate(out, models[ANCHORED], parts["test"][0])
+    return DemoResult(
+        out,
+        evaluation,
+        trainings,
+        {name: about for name, about in _WRITTEN.items() if (out / name).exists()},
+        messages,
+        time.perf_counter() - started,
+    )
+
+
+_WRITTEN = {
+    "results.csv": "a line per predictor",
+    "results.json": "all scores, per channel and by age of the last observation",
+    "learning_curves.png": "validation error while training",
+    "predictions.png": "four channels of the first test trajectory",
+    "hopper.gif": "the same trajectory, simulated and predicted one step ahead",
+    "hopper_extrapolation.gif": "the same, nothing observed any more from the middle on",
+    "models": "a run per model: log.csv, checkpoints, the trained model",
+    "data": "training, validation and test part",
+    "settings.json": "what this folder was made with",
+}
+
+
+def _check_folder(out: Path, settings: Mapping[str, Any]) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; the demo needs a folder to write to")
+    record = out / "settings.json"
+    if not record.exists():
+        return
+    try:
+        then = dict(json.loads(record.read_text(encoding="utf-8")))
+    except (ValueError, TypeError):
+        then = {}
+    changed = {k: v for k, v in settings.items() if then.get(k) != v}
+    other = [f"{k} ({then.get(k)!r} then, {v!r} now)" for k, v in changed.items()]
+    if other:
+        raise InputError(
+            f"{out} holds a demo with another {', '.join(other)}; give the same, or another folder"
+        )
+
+
+# --- training, side by side -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One model to train, in this process or in another."""
+
+    name: str
+    training: TrainConfig
+    scaler: Scaler
+    out: Path
+
+    def run(self, *, progress: bool) -> None:
+        """Trains, or goes on training; the same in any process."""
+        train, validation = (load(self.out / "data" / f"{p}.parquet") for p in _PARTS[:2])
+        model = make(self.name, train, scaler=self.scaler, seed=self.training.seed)
+        with _one_thread():
+            fit(model, train, validation, self.training, out=self.folder, progress=progress)
+
+    @property
+    def folder(self) -> Path:
+        return self.out / "models" / self.name
+
+    def history(self) -> tuple[EpochRecord, ...]:
+        """What its log holds so far."""
+        log = self.folder / "log.csv"
+        if not log.exists():
+            return ()
+        with log.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.DictReader(file))
+        return tuple(
+            EpochRecord(
+                int(line.pop("epoch")),
+                int(line.pop("steps")),
+                **{name: float(value) for name, value in line.items()},
+            )
+            for line in lines
+        )
+
+
+def _train(jobs: Sequence[_Job], workers: int, progress: bool) -> None:
+    if workers == 1:
+        for job in jobs:
+            if progress:
+                print(f"training {style_of(job.name).label}", file=sys.stderr)
+            job.run(progress=progress)
+        return
+    waiting, running = list(jobs), dict[Any, tuple[_Job, Any, Any]]()
+    context = multiprocessing.get_context("spawn")  # a fork after torch has computed can hang
+    total = sum(job.training.epochs for job in jobs)
+    with tqdm(total=total, desc="training", unit="epoch", disable=not progress) as bar:
+        try:
+            while waiting or running:
+                while waiting and len(running) < workers:
+                    job = waiting.pop(0)
+                    receiver, sender = context.Pipe(duplex=False)
+                    process = context.Process(target=_run_apart, args=(job, sender), daemon=True)
+                    process.start()
+                    sender.close()
+                    running[process.sentinel] = (job, process, receiver)
+                for sentinel in connection.wait(list(running), timeout=0.5):
+                    _collect(*running.pop(sentinel))
+                bar.update(sum(len(job.history()) for job in jobs) - bar.n)
+                bar.set_postfix_str(", ".join(job.name for job, _, _ in running.values()))
+        finally:
+            for _, process, _ in running.values():
+                process.terminate()
+                process.join()
+
+
+def _run_apart(job: _Job, sender: Any) -> None:
+    """A process that trains one model; it ends with the process that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        job.run(progress=False)
+    except OffbeatError as error:
+        sender.send(error)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _collect(job: _Job, process: Any, receiver: Any) -> None:
+    process.join()
+    if receiver.poll():
+        with suppress(EOFError):  # it ended without a word
+            raise receiver.recv()
+    if process.exitcode:
+        raise OffbeatError(
+            f"the process that trained {job.name!r} ended with exit code {process.exitcode}; run "
+            "the same again, it goes on where it was (with workers=1 it needs less memory)"
+        )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Sums in one order, on any machine; and small steps are faster so."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+# --- what is left on disk -------------------------------------------------------------------------
+
+
+def _write_scores(out: Path, evaluation: Evaluation, trainings: Mapping[str, Training]) -> None:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    measured = [f"{scoring}_rmse" for scoring in SCORINGS]
+    table.writerow(["model", "steps", "epochs", "training_seconds", *measured, "under_trained"])
+    for name, scores in evaluation.scores.items():
+        trained = trainings.get(name)
+        table.writerow(
+            [
+                name,
+                trained.steps if trained else 0,
+                len(trained.history) if trained else 0,
+                round(trained.seconds, 2) if trained else 0,
+                *(getattr(scores, scoring).rmse for scoring in SCORINGS),
+                str(trained.under_trained if trained else False).lower(),
+            ]
+        )
+    write_text(out / "results.csv", text.getvalue())
+    write_json(out / "results.json", evaluation.to_dict())
+
+
+def _draw(
+    out: Path,
+    models: Mapping[str, RecurrentModel],
+    parts: Mapping[str, Dataset],
+    trainings: Mapping[str, Training],
+) -> None:
+    trivial = evaluate(models[THESIS_MODELS[0]], parts["validation"]).scores[LAST_VALUE]
+    curves = figures.learning_curves(
+        {name: training.history for name, training in trainings.items()},
+        last_value_rmse=trivial.honest.rmse,
+        x="steps",
+        units="(x - min) / max",
+    )
+    figures.save(curves, out / "learning_curves.png")
+    shown = parts["test"][:1]
+    panels = figures.predictions(
+        shown[0],
+        {name: predict(model, shown)[0] for name, model in models.items()},
+        CHANNELS,
+        title=f"One-step-ahead predictions, {shown[0].origin} of the test part",
+    )
+    figures.save(panels, out / "predictions.png")
+
+
+def _animate(out: Path, model: RecurrentModel, shown: Trajectory) -> tuple[str, ...]:
+    """Two GIFs of one trajectory; or, where MuJoCo cannot render, a line that says why not."""
+    free = ROWS // 2
+    unseen = shown.observed & (np.arange(shown.rows) < free)[:, None]
+    label = style_of(model.config.name).label
+    views = {
+        "hopper.gif": (shown, f"{label}: each row predicted from the observed rows before it"),
+        "hopper_extrapolation.gif": (
+            replace(shown, observed=unseen),
+            f"{label}: nothing observed any more from "
+            f"{1e3 * (shown.times[free] - shown.times[0]):.0f} ms on",
+        ),
+    }
+    qpos = [i for i, name in enumerate(shown.names) if name.endswith("_qpos")]
+    for name, (trajectory, caption) in views.items():
+        predicted = predict(model, Dataset((trajectory,)))[0]
+        try:
+            side_by_side(
+                ROBOT,
+                trajectory.values[:, qpos],
+                predicted.values[:, qpos],
+                out / name,
+                times=trajectory.times,
+                observed=trajectory.observed.any(axis=1),
+                labels=("simulated", "predicted (blue: simulated)"),
+                caption=caption,
+            )
+        except MissingExtraError as error:
+            return (f"No animation: {error}.",)
+    return ()

@@ -1,0 +1,81 @@
+"""One look for every figure: a label, a colour and a dash per model, fixed once."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Style:
+    """How one predictor is drawn, in every figure.
+
+    Attributes:
+        label: its name in legends and captions.
+        colour: hexadecimal, told apart by colour-blind readers.
+        marker: of points.
+        dash: line style of matplotlib; with it, lines stay apart in black and white.
+    """
+
+    label: str
+    colour: str
+    marker: str
+    dash: Any = "-"
+
+
+_DOTTED: Any = (0, (1, 1.2))
+_DASHED: Any = (0, (5, 1.5))
+_DASH_DOT: Any = (0, (5, 1.2, 1, 1.2))
+
+STYLES: dict[str, Style] = {
+    # The palette of Okabe and Ito (2008), then, for models met more rarely, that of Tol (2021).
+    "truth": Style("Truth", "#000000", ""),
+    "last_value": Style("Last value", "#7F7F7F", "", (0, (4, 2))),
+    "gru": Style("GRU", "#56B4E9", "o", _DOTTED),
+    "gru_d": Style("GRU-D", "#E69F00", "s", _DASH_DOT),
+    "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),
+    "ode_gru_d": Style("ODE-GRU-D", "#0072B2", "D", (0, (8, 1.5))),
+    "anchored_ode_gru_d": Style("Anchored ODE-GRU-D", "#D55E00", "o"),
+    "rnn_decay": Style("RNN-Decay", "#CC79A7", "v", _DASH_DOT),
+    "rnn": Style("RNN", "#999933", "P", _DOTTED),
+    "lstm": Style("LSTM", "#332288", "X", _DOTTED),
+    "neural_ode": Style("Neural ODE", "#882255", "*", _DASHED),
+}
+"""The styles by id of the model; `truth` and `last_value` stand beside them."""
+
+_OTHERS = ("#44AA99", "#AA4499", "#117733", "#661100", "#6699CC")
+
+
+def style_of(name: str) -> Style:
+    """The style of a predictor; a name without an entry gets one that follows from the name."""
+    if name in STYLES:
+        return STYLES[name]
+    return Style(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)], "o")
+
+
+RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
+    "font.size": 9,
+    "axes.labelsize": 9,
+    "axes.titlesize": 9,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "legend.handlelength": 2.6,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 3.6,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "pdf.fonttype": 42,  # text stays text
+    "svg.fonttype": "none",
+}
+"""Settings of matplotlib, in force only while a figure is made or saved."""
