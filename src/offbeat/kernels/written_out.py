@@ -68,8 +68,6 @@ class _Record:
 
         n = spec.hidden_size
         self.start = empty(spec.state_size)  # where the vector field is evaluated
-        self.before = empty(spec.state_size)
-        self.after = empty(spec.state_size)
         hidden = [weight.shape[0] for weight in field[:-2:2]]
         self.layers = [empty(units) for units in hidden]
         # SiLU's derivative needs its argument, tanh's only its value.
@@ -93,11 +91,12 @@ class _WrittenOut(Function):
         *field: Tensor,
     ) -> tuple[Tensor, Tensor]:
         record = _Record(spec, gates, field)
+        befores, afters = torch.empty_like(record.start), torch.empty_like(record.start)
         n, a = spec.hidden_size, spec.anchored
         pairs = [(w.t(), b) for w, b in zip(field[::2], field[1::2], strict=True)]
         first_state = state
         for i in range(len(gates)):
-            start, before, after = record.start[i], record.before[i], record.after[i]
+            start, before, after = record.start[i], befores[i], afters[i]
             start.copy_(state)
             if factor is not None:
                 start[:, a:].mul_(factor[i])
@@ -123,14 +122,15 @@ class _WrittenOut(Function):
                 after[:, a:] = torch.lerp(h, candidate, zr[:, :n] * update)
             state = after
         ctx.spec, ctx.rows, ctx.record = spec, rows, record
-        ctx.save_for_backward(factor, first_state, recurrent, innovation, *field)
-        return record.before, record.after
+        # What is returned must be kept this way: as attributes it would never be freed.
+        ctx.save_for_backward(befores, afters, factor, first_state, recurrent, innovation, *field)
+        return befores, afters
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_before: Tensor, to_after: Tensor) -> tuple[Any, ...]:
         spec, rows, record = ctx.spec, ctx.rows, ctx.record
-        factor, first_state, recurrent, innovation, *field = ctx.saved_tensors
+        befores, afters, factor, first_state, recurrent, innovation, *field = ctx.saved_tensors
         n, a = spec.hidden_size, spec.anchored
         weights = field[::2]
         to_gates = torch.empty_like(rows.gates)
@@ -141,7 +141,7 @@ class _WrittenOut(Function):
         grad = torch.zeros_like(first_state)
         for i in reversed(range(len(to_gates))):
             grad = grad + to_after[i]
-            h, update = record.before[i, :, a:], rows.update[i]
+            h, update = befores[i, :, a:], rows.update[i]
             to_h, to_gate = grad[:, a:], to_gates[i]
             if spec.cell == "set":
                 torch.mul(to_h, update, out=to_gate)
@@ -165,7 +165,7 @@ class _WrittenOut(Function):
                 grad[:, a:].mul_(factor[i])
         to_factor = None
         if factor is not None:
-            previous = torch.cat([first_state[None], record.after[:-1]])
+            previous = torch.cat([first_state[None], afters[:-1]])
             to_factor = (to_start * previous)[..., a:]
         inputs = [record.start, *record.layers]
         to_field = [
@@ -177,7 +177,7 @@ class _WrittenOut(Function):
         if spec.cell == "gru":
             gated, candidates = to_gates[..., : 2 * n], to_gates[..., 2 * n :]
             to_recurrent = torch.cat(
-                [_product(gated, record.before[..., a:]), _product(candidates, record.reset_h)]
+                [_product(gated, befores[..., a:]), _product(candidates, record.reset_h)]
             )
         to_innovation = _product(to_gates, record.innovation) if a else None
         return (None, None, to_gates, to_factor, grad, to_recurrent, to_innovation, *to_field)

@@ -1,0 +1,340 @@
+"""The command `offbeat`: each subcommand is a function, its options are the function's arguments.
+
+Torch and everything else that is slow to import is imported inside the functions, so that
+`offbeat --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json as json_
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from offbeat.config import ModelConfig, PartsConfig, TrainConfig
+from offbeat.errors import InputError, OffbeatError, one_of
+
+if TYPE_CHECKING:
+    from offbeat.data.trajectory import Dataset
+
+DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
+
+A first way through, from simulation to a scored model:
+
+  offbeat simulate hopper.parquet --n_trajectories 2000
+  offbeat train hopper.parquet runs/first --parts.window 100 --parts.observed_fraction 0.3 \\
+      --model.name ode_rnn --training.epochs 5
+  offbeat evaluate runs/first hopper.parquet
+  offbeat predict runs/first hopper.parquet predictions.csv
+
+Or all of it at once, every model beside the trivial predictor: offbeat demo"""
+
+
+def simulate(
+    out: Path,
+    robot: str = "hopper",
+    n_trajectories: int = 10_000,
+    rows: int = 200,
+    seed: int = 0,
+    threads: int | None = None,
+    json: bool = False,
+) -> None:
+    """Simulate a robot falling without control, and write a data set.
+
+    Args:
+        out: Parquet file to write.
+        robot: hopper or walker.
+        n_trajectories: how many, each from its own random state.
+        rows: rows per trajectory; one per physics step, 5 ms for the hopper.
+        seed: of the initial states; 123 is the draw of the thesis' protocol.
+        threads: of the simulation; all cores by default. They do not change the result.
+        json: print what was written as JSON.
+    """
+    from offbeat.data.simulate import simulate as run
+    from offbeat.data.store import save
+
+    if out.suffix != ".parquet":
+        raise InputError(f"out must be a .parquet file, got {out}")
+    dataset = run(robot, n_trajectories, rows, seed=seed, threads=threads)
+    save(dataset, out)
+    _say({"written": str(out), "meta": dict(dataset.meta)}, f"{out}: {dataset!r}", json)
+
+
+def train(
+    data: Path,
+    out: Path,
+    model: ModelConfig = ModelConfig(),  # noqa: B008  # frozen
+    training: TrainConfig = TrainConfig(),  # noqa: B008
+    parts: PartsConfig = PartsConfig(),  # noqa: B008
+    scaler: str = "standardise",
+    seed: int = 0,
+    threads: int = 1,
+    json: bool = False,
+) -> None:
+    """Train a model on a data set, and score it on the part that was held out.
+
+    Args:
+        data: data set (.parquet) or CSV.
+        out: folder of the run: config.yaml, log.csv, checkpoints, model, results.json. A run that
+            was stopped goes on where it was.
+        model: what the model consists of; only the name is needed.
+        training: epochs, optimizer and the rest.
+        parts: windows, hidden rows, and the split into training, validation and test.
+        scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
+        seed: of the initial weights.
+        threads: of torch; one is fastest for models of this size.
+        json: print the scores as JSON.
+    """
+    import torch
+    import yaml
+
+    from offbeat.data.prepare import SCALERS
+    from offbeat.data.prepare import parts as cut
+    from offbeat.data.readers import read
+    from offbeat.evaluation import evaluate as score
+    from offbeat.files import write_json, write_text
+    from offbeat.models.zoo import make
+    from offbeat.training import fit
+
+    one_of("scaler", scaler, SCALERS)
+    torch.set_num_threads(threads)
+    dataset = read(data)
+    train_part, validation, test = cut(dataset, parts)
+    made = make(model, train_part, scaler=scaler, seed=seed)  # type: ignore[arg-type]
+    resolved = {
+        "data": str(data),
+        "out": str(out),
+        "model": _plain(asdict(made.config)),
+        "training": _plain(asdict(training)),
+        "parts": _plain(asdict(parts)),
+        "scaler": scaler,
+        "seed": seed,
+        "threads": threads,
+    }
+    fitted = fit(made, train_part, validation, training, out=out)
+    write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
+    write_json(out / "parts.json", {**_plain(asdict(parts)), "data": _fingerprint(dataset)})
+    evaluation = score(made, test)
+    result = {"steps": fitted.steps, "part": "test", **evaluation.to_dict()}
+    write_json(out / "results.json", result)
+    heading = f"{out}: {fitted.steps} steps; RMSE on the test part, in scaled units ({scaler})"
+    _say(result, f"{heading}\n{evaluation.table()}", json)
+
+
+def evaluate(
+    model: Path,
+    data: Path,
+    part: str = "test",
+    observed_fraction: float | None = None,
+    out: Path | None = None,
+    seed: int = 0,
+    json: bool = False,
+) -> None:
+    """Score a trained model beside the last observed value.
+
+    Args:
+        model: folder of a run or of a checkpoint.
+        data: data set (.parquet) or CSV.
+        part: test, validation, train or all. On the data that the run was trained on, the same
+            windows, hidden rows and split are made again; other data can only be scored as a whole.
+        observed_fraction: hide rows of other data at random, this share stays observed.
+        out: JSON file for the scores.
+        seed: of hidden rows and coins.
+        json: print the scores as JSON.
+    """
+    from offbeat.data.readers import read
+    from offbeat.data.thin import thin
+    from offbeat.evaluation import evaluate as score
+    from offbeat.files import write_json
+    from offbeat.models.checkpoint import load_checkpoint
+
+    one_of("part", part, ("train", "validation", "test", "all"))
+    loaded = load_checkpoint(model)
+    dataset = read(data)
+    own = _own_parts(model, dataset)
+    if own is not None and part != "all":
+        if observed_fraction is not None:
+            raise InputError(
+                "the rows hidden in training are hidden again; leave observed_fraction out, or "
+                "give --part all"
+            )
+        dataset = dict(zip(("train", "validation", "test"), own, strict=True))[part]
+    else:
+        part = "all"
+        if observed_fraction is not None:
+            dataset = thin(dataset, observed_fraction, seed=seed)
+    evaluation = score(loaded, dataset, seed=seed)
+    result = {"part": part, **evaluation.to_dict()}
+    if out is not None:
+        write_json(out, result)
+    heading = f"RMSE in scaled units ({evaluation.scaler}), part: {part}, {len(dataset)} trajectories"
+    _say(result, f"{heading}\n{evaluation.table()}", json)
+
+
+def predict(
+    model: Path,
+    data: Path,
+    out: Path,
+    times: list[float] | None = None,
+    time_unit: str | None = None,
+    seed: int = 0,
+    json: bool = False,
+) -> None:
+    """Predict at the rows of a data set, one step ahead, or at asked times.
+
+    Each prediction is made from what was observed strictly before its time, and written in the
+    original units.
+
+    Args:
+        model: folder of a run or of a checkpoint.
+        data: data set (.parquet) or CSV with a column `time`; empty cells are not known.
+        out: .csv or .parquet file with columns trajectory, time and one per channel.
+        times: s, on the clock of the data; later than its last row is fine. By default its rows.
+        time_unit: of the times in a CSV: s, ms, us or ns; by default what its header says.
+        seed: of the coins of self-feeding.
+        json: print what was written as JSON.
+    """
+    import numpy as np
+
+    from offbeat.data.readers import read
+    from offbeat.data.readers.table import write_table
+    from offbeat.inference import predict as run
+    from offbeat.models.checkpoint import load_checkpoint
+
+    loaded = load_checkpoint(model)
+    dataset = read(data) if time_unit is None else read(data, time_unit=time_unit)
+    predicted = run(loaded, dataset, times=times, seed=seed)
+    labels = [np.full(t.rows, i) for i, t in enumerate(predicted)]
+    values = np.concatenate([t.values for t in predicted])
+    columns: dict[str, Any] = {
+        "trajectory": np.concatenate(labels),
+        "time": np.concatenate([t.times for t in predicted]),
+        **{name: values[:, i] for i, name in enumerate(predicted.names)},
+    }
+    write_table(out, columns)
+    rows = len(values)
+    _say({"written": str(out), "rows": rows}, f"{out}: {rows} predictions", json)
+
+
+def demo(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:
+    """Run everything once, small: simulate, hide rows, train five models, score, draw.
+
+    Args:
+        out: folder for the table, the figures, the animation and the trained models.
+        seed: of windows, hidden rows, split, weights and batches.
+        json: print the scores as JSON.
+    """
+    from offbeat.demo import run_demo
+
+    result = run_demo(out, seed=seed)
+    if json:
+        _say(result.to_dict(), "", json)
+
+
+def doctor(json: bool = False) -> None:
+    """Tell versions, threads, and what is installed.
+
+    Args:
+        json: print as JSON.
+    """
+    from offbeat.doctor import examine
+
+    findings = examine()
+    width = max(len(name) for name in findings)
+    text = "\n".join(f"{name.ljust(width)}  {value}" for name, value in findings.items())
+    _say(findings, text, json)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "simulate": simulate,
+    "train": train,
+    "evaluate": evaluate,
+    "predict": predict,
+    "demo": demo,
+    "doctor": doctor,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns its exit code.
+
+    0 is success, 2 bad input (one line on standard error says what is wrong), 1 a computation that
+    failed, 130 an interrupt.
+    """
+    from jsonargparse import ArgumentError, auto_cli
+
+    arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    if arguments == ["--version"]:
+        from offbeat import __version__
+
+        print(f"offbeat {__version__}")
+        return 0
+    try:
+        auto_cli(
+            COMMANDS,
+            args=arguments,
+            prog="offbeat",
+            description=DESCRIPTION,
+            formatter_class=_formatter(),
+            exit_on_error=False,
+        )
+    except ArgumentError as error:
+        return _fail(str(error), 2)
+    except (OffbeatError, OSError) as error:
+        return _fail(str(error), 1 if isinstance(error, ArithmeticError) else 2)
+    except KeyboardInterrupt:
+        return _fail("interrupted; the same command goes on from the last checkpoint", 130)
+    return 0
+
+
+def _fail(message: str, code: int) -> int:
+    line = " ".join(message.split())
+    print(f"offbeat: error: {line}", file=sys.stderr)
+    return code
+
+
+def _say(result: Any, text: str, as_json: bool) -> None:
+    print(json_.dumps(result, indent=2) if as_json else text)
+
+
+def _formatter() -> type:
+    from jsonargparse import DefaultHelpFormatter
+
+    class Formatter(DefaultHelpFormatter):
+        """Leaves the lines of the description as they are."""
+
+        def _fill_text(self, text: str, width: int, indent: str) -> str:
+            return "".join(indent + line for line in text.splitlines(keepends=True))
+
+    return Formatter
+
+
+def _plain(config: dict[str, Any]) -> dict[str, Any]:
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in config.items()}
+
+
+def _fingerprint(dataset: Dataset) -> str:
+    """Of the values, times and masks of a data set; equal for equal data alone."""
+    import hashlib
+
+    digest = hashlib.sha256("\0".join(dataset.names).encode())
+    for trajectory in dataset:
+        for array in (trajectory.times, trajectory.values, trajectory.observed):
+            digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _own_parts(run: Path, dataset: Dataset) -> tuple[Dataset, ...] | None:
+    """The parts that a run was trained with, if this is the data it was trained on."""
+    from offbeat.config import from_mapping
+    from offbeat.data.prepare import parts
+
+    record = run / "parts.json"
+    if not record.is_file():
+        return None
+    kept = json_.loads(record.read_text(encoding="utf-8"))
+    if kept.pop("data") != _fingerprint(dataset):
+        return None
+    return parts(dataset, from_mapping(PartsConfig, kept))
