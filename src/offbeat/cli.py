@@ -11,13 +11,10 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from offbeat.config import ModelConfig, PartsConfig, TrainConfig
 from offbeat.errors import InputError, OffbeatError, one_of
-
-if TYPE_CHECKING:
-    from offbeat.data.trajectory import Dataset
 
 DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
 
@@ -32,7 +29,7 @@ A first way through, from simulation to a scored model:
 Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 
 
-def simulate(
+def simulate_command(
     out: Path,
     robot: str = "hopper",
     n_trajectories: int = 10_000,
@@ -52,17 +49,17 @@ def simulate(
         threads: of the simulation; all cores by default. They do not change the result.
         json: print what was written as JSON.
     """
-    from offbeat.data.simulate import simulate as run
+    from offbeat.data.simulate import simulate
     from offbeat.data.store import save
 
     if out.suffix != ".parquet":
         raise InputError(f"out must be a .parquet file, got {out}")
-    dataset = run(robot, n_trajectories, rows, seed=seed, threads=threads)
+    dataset = simulate(robot, n_trajectories, rows, seed=seed, threads=threads)
     save(dataset, out)
     _say({"written": str(out), "meta": dict(dataset.meta)}, f"{out}: {dataset!r}", json)
 
 
-def train(
+def train_command(
     data: Path,
     out: Path,
     model: ModelConfig = ModelConfig(),  # noqa: B008  # frozen
@@ -90,10 +87,10 @@ def train(
     import torch
     import yaml
 
-    from offbeat.data.prepare import SCALERS
+    from offbeat.data.prepare import SCALERS, save_parts
     from offbeat.data.prepare import parts as cut
     from offbeat.data.readers import read
-    from offbeat.evaluation import evaluate as score
+    from offbeat.evaluation import evaluate
     from offbeat.files import write_json, write_text
     from offbeat.models.zoo import make
     from offbeat.training import fit
@@ -115,15 +112,15 @@ def train(
     }
     fitted = fit(made, train_part, validation, training, out=out)
     write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
-    write_json(out / "parts.json", {**_plain(asdict(parts)), "data": _fingerprint(dataset)})
-    evaluation = score(made, test)
+    save_parts(out / "parts.json", parts, dataset)
+    evaluation = evaluate(made, test)
     result = {"steps": fitted.steps, "part": "test", **evaluation.to_dict()}
     write_json(out / "results.json", result)
     heading = f"{out}: {fitted.steps} steps; RMSE on the test part, in scaled units ({scaler})"
     _say(result, f"{heading}\n{evaluation.table()}", json)
 
 
-def evaluate(
+def evaluate_command(
     model: Path,
     data: Path,
     part: str = "test",
@@ -144,16 +141,17 @@ def evaluate(
         seed: of hidden rows and coins.
         json: print the scores as JSON.
     """
+    from offbeat.data.prepare import load_parts
     from offbeat.data.readers import read
     from offbeat.data.thin import thin
-    from offbeat.evaluation import evaluate as score
+    from offbeat.evaluation import evaluate
     from offbeat.files import write_json
     from offbeat.models.checkpoint import load_checkpoint
 
     one_of("part", part, ("train", "validation", "test", "all"))
     loaded = load_checkpoint(model)
     dataset = read(data)
-    own = _own_parts(model, dataset)
+    own = load_parts(model / "parts.json", dataset)
     if own is not None and part != "all":
         if observed_fraction is not None:
             raise InputError(
@@ -165,7 +163,7 @@ def evaluate(
         part = "all"
         if observed_fraction is not None:
             dataset = thin(dataset, observed_fraction, seed=seed)
-    evaluation = score(loaded, dataset, seed=seed)
+    evaluation = evaluate(loaded, dataset, seed=seed)
     result = {"part": part, **evaluation.to_dict()}
     if out is not None:
         write_json(out, result)
@@ -173,7 +171,7 @@ def evaluate(
     _say(result, f"{heading}\n{evaluation.table()}", json)
 
 
-def predict(
+def predict_command(
     model: Path,
     data: Path,
     out: Path,
@@ -199,13 +197,13 @@ def predict(
     import numpy as np
 
     from offbeat.data.readers import read
-    from offbeat.data.readers.table import write_table
-    from offbeat.inference import predict as run
+    from offbeat.data.writers import write_table
+    from offbeat.inference import predict
     from offbeat.models.checkpoint import load_checkpoint
 
     loaded = load_checkpoint(model)
     dataset = read(data) if time_unit is None else read(data, time_unit=time_unit)
-    predicted = run(loaded, dataset, times=times, seed=seed)
+    predicted = predict(loaded, dataset, times=times, seed=seed)
     labels = [np.full(t.rows, i) for i, t in enumerate(predicted)]
     values = np.concatenate([t.values for t in predicted])
     columns: dict[str, Any] = {
@@ -218,7 +216,7 @@ def predict(
     _say({"written": str(out), "rows": rows}, f"{out}: {rows} predictions", json)
 
 
-def demo(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:
+def demo_command(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:
     """Run everything once, small: simulate, hide rows, train five models, score, draw.
 
     Args:
@@ -233,7 +231,7 @@ def demo(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> No
         _say(result.to_dict(), "", json)
 
 
-def doctor(json: bool = False) -> None:
+def doctor_command(json: bool = False) -> None:
     """Tell versions, threads, and what is installed.
 
     Args:
@@ -247,13 +245,15 @@ def doctor(json: bool = False) -> None:
     _say(findings, text, json)
 
 
+# The functions are not named after the commands: jsonargparse would find their namesakes in the
+# lazy package `offbeat`, and import torch to look at them.
 COMMANDS: dict[str, Callable[..., None]] = {
-    "simulate": simulate,
-    "train": train,
-    "evaluate": evaluate,
-    "predict": predict,
-    "demo": demo,
-    "doctor": doctor,
+    "simulate": simulate_command,
+    "train": train_command,
+    "evaluate": evaluate_command,
+    "predict": predict_command,
+    "demo": demo_command,
+    "doctor": doctor_command,
 }
 
 
@@ -266,6 +266,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     from jsonargparse import ArgumentError, auto_cli
 
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    # A flag, although options made from bool arguments want a value.
+    arguments = ["--json=true" if argument == "--json" else argument for argument in arguments]
     if arguments == ["--version"]:
         from offbeat import __version__
 
@@ -313,28 +315,3 @@ def _formatter() -> type:
 
 def _plain(config: dict[str, Any]) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in config.items()}
-
-
-def _fingerprint(dataset: Dataset) -> str:
-    """Of the values, times and masks of a data set; equal for equal data alone."""
-    import hashlib
-
-    digest = hashlib.sha256("\0".join(dataset.names).encode())
-    for trajectory in dataset:
-        for array in (trajectory.times, trajectory.values, trajectory.observed):
-            digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
-def _own_parts(run: Path, dataset: Dataset) -> tuple[Dataset, ...] | None:
-    """The parts that a run was trained with, if this is the data it was trained on."""
-    from offbeat.config import from_mapping
-    from offbeat.data.prepare import parts
-
-    record = run / "parts.json"
-    if not record.is_file():
-        return None
-    kept = json_.loads(record.read_text(encoding="utf-8"))
-    if kept.pop("data") != _fingerprint(dataset):
-        return None
-    return parts(dataset, from_mapping(PartsConfig, kept))

@@ -301,8 +301,11 @@ def _train(jobs: Sequence[_Job], workers: int, progress: bool) -> None:
                     running[process.sentinel] = (job, process, receiver)
                 for sentinel in connection.wait(list(running), timeout=0.5):
                     _collect(*running.pop(sentinel))
-                bar.update(sum(len(job.history()) for job in jobs) - bar.n)
-                bar.set_postfix_str(", ".join(job.name for job, _, _ in running.values()))
+                new = sum(len(job.history()) for job in jobs) - bar.n
+                if new:
+                    names = ", ".join(job.name for job, _, _ in running.values())
+                    bar.set_postfix_str(names, refresh=False)
+                    bar.update(new)
         finally:
             for _, process, _ in running.values():
                 process.terminate()

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.config import PartsConfig
+from offbeat.config import PartsConfig, from_mapping
 from offbeat.data.thin import thin
 from offbeat.data.trajectory import Dataset
-from offbeat.errors import InputError, one_of
+from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.files import write_json
 
 ScalerKind = Literal["standardise", "min_max", "divide_by_max", "identity"]
 SCALERS: tuple[str, ...] = ("standardise", "min_max", "divide_by_max", "identity")
@@ -96,6 +99,41 @@ def parts(dataset: Dataset, config: PartsConfig) -> tuple[Dataset, Dataset, Data
         dataset = thin(dataset, config.observed_fraction, seed=config.seed)
     train, validation, test = split(dataset, config.fractions, seed=config.seed)
     return train, validation, test
+
+
+def save_parts(path: str | Path, config: PartsConfig, dataset: Dataset) -> None:
+    """Writes down how a data set was cut, so that `load_parts` can cut it so again.
+
+    Args:
+        path: JSON file to write.
+        config: as given to `parts`.
+        dataset: as given to `parts`.
+    """
+    write_json(path, {**asdict(config), "data": dataset.fingerprint()})
+
+
+def load_parts(path: str | Path, dataset: Dataset) -> tuple[Dataset, Dataset, Dataset] | None:
+    """Cuts a data set as it was cut before: training, validation and test part.
+
+    Args:
+        path: JSON file that `save_parts` wrote.
+        dataset: as recorded.
+
+    Returns:
+        The three parts, or None if the file is missing or was written for other data.
+
+    Raises:
+        FileFormatError: the file is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        same = kept.pop("data") == dataset.fingerprint()
+        return parts(dataset, from_mapping(PartsConfig, kept)) if same else None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path} is damaged ({error}); train again") from None
 
 
 @dataclass(frozen=True, eq=False)

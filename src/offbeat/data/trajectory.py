@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, overload
@@ -258,6 +259,14 @@ class Dataset(Sequence[Trajectory]):
     def take(self, index: Sequence[int] | NDArray[np.int64]) -> Dataset:
         """The trajectories at these positions, in this order."""
         return replace(self, trajectories=tuple(self.trajectories[int(i)] for i in index))
+
+    def fingerprint(self) -> str:
+        """SHA-256 of names, times, values and masks: equal for equal data alone."""
+        digest = hashlib.sha256("\0".join(self.names).encode())
+        for trajectory in self:
+            for array in (trajectory.times, trajectory.values, trajectory.observed):
+                digest.update(np.ascontiguousarray(array))
+        return digest.hexdigest()
 
     def select(self, names: Sequence[str]) -> Dataset:
         """These channels, in this order.

@@ -54,7 +54,7 @@ def style_of(name: str) -> Style:
     return Style(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)], "o")
 
 
-RC: dict[str, Any] = {
+RC: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
     "font.size": 9,
     "axes.labelsize": 9,
