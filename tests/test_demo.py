@@ -139,6 +139,7 @@ def test_a_demo_that_was_stopped_goes_on_where_it_was(made, copy):
     assert without_seconds(copy) == without_seconds(made.folder)
 
 
+@pytest.mark.slow
 def test_two_processes_train_the_same_models_as_one(made, tmp_path, capsys):
     run_demo(tmp_path / "two", workers=2, **TINY)
     assert weights(tmp_path / "two") == weights(made.folder)

@@ -71,7 +71,9 @@ def test_learning_curves_draw_the_root_of_each_logged_error(x, first):
 
 
 def test_the_axes_of_learning_curves_say_what_they_count_and_in_which_units():
-    axes = figures.learning_curves({"gru": log(0.5)}, x="steps", units="standard deviations").axes[0]
+    axes = figures.learning_curves({"gru": log(0.5)}, x="steps", units="standard deviations").axes[
+        0
+    ]
     assert axes.get_xlabel() == "Optimizer steps"
     assert axes.get_ylabel() == "Validation RMSE, honest (standard deviations)"
     assert figures.learning_curves({"gru": log(0.5)}).axes[0].get_xlabel() == "Epoch"
@@ -301,7 +303,9 @@ def test_an_animation_of_what_does_not_fit_is_refused(tmp_path, options, said):
 
 def test_positions_of_another_robot_or_not_finite_are_refused(tmp_path):
     times, good = np.arange(2) * 0.005, np.zeros((2, 7))
-    with pytest.raises(InputError, match=r"predicted_qpos must have shape \(rows, 7\), got \(2, 9\)"):
+    with pytest.raises(
+        InputError, match=r"predicted_qpos must have shape \(rows, 7\), got \(2, 9\)"
+    ):
         animation.side_by_side("hopper", good, np.zeros((2, 9)), tmp_path / "a.gif", times=times)
     bad = np.where(np.arange(2)[:, None] == 1, np.nan, good)
     with pytest.raises(InputError, match="truth_qpos is not finite at row 1"):

@@ -188,8 +188,9 @@ def predict_command(
     Args:
         model: folder of a run or of a checkpoint.
         data: data set (.parquet) or CSV with a column `time`; empty cells are not known.
-        out: .csv or .parquet file with columns trajectory, time and one per channel.
-        times: s, on the clock of the data; later than its last row is fine. By default its rows.
+        out: .csv or .parquet file with columns trajectory, time (s) and one per channel.
+        times: s, on the clock of the data, or since its first row where that clock is made of
+            integers; later than the last row is fine. By default the times of the rows.
         time_unit: of the times in a CSV: s, ms, us or ns; by default what its header says.
         seed: of the coins of self-feeding.
         json: print what was written as JSON.
@@ -197,23 +198,28 @@ def predict_command(
     import numpy as np
 
     from offbeat.data.readers import read
+    from offbeat.data.trajectory import SECONDS_PER
     from offbeat.data.writers import write_table
     from offbeat.inference import predict
     from offbeat.models.checkpoint import load_checkpoint
 
+    one_of("suffix of out", out.suffix, (".csv", ".parquet"))
     loaded = load_checkpoint(model)
     dataset = read(data) if time_unit is None else read(data, time_unit=time_unit)
     predicted = predict(loaded, dataset, times=times, seed=seed)
-    labels = [np.full(t.rows, i) for i, t in enumerate(predicted)]
+    each = [t.rows for t in predicted]
+    labels = np.asarray(dataset.meta.get("labels", range(len(predicted))))
+    seconds = np.concatenate([t.times for t in predicted])
+    columns: dict[str, Any] = {"trajectory": np.repeat(labels, each), "time": seconds}
+    if "clock_start" in dataset.meta:
+        # An integer clock was read relative to its first row; this puts it back, to the tick.
+        unit, start = dataset.meta["time_unit"], np.repeat(dataset.meta["clock_start"], each)
+        ticks = seconds / SECONDS_PER[unit]
+        columns[f"clock_{unit}"] = start + (ticks if unit == "s" else np.rint(ticks).astype(int))
     values = np.concatenate([t.values for t in predicted])
-    columns: dict[str, Any] = {
-        "trajectory": np.concatenate(labels),
-        "time": np.concatenate([t.times for t in predicted]),
-        **{name: values[:, i] for i, name in enumerate(predicted.names)},
-    }
+    columns.update({name: values[:, i] for i, name in enumerate(predicted.names)})
     write_table(out, columns)
-    rows = len(values)
-    _say({"written": str(out), "rows": rows}, f"{out}: {rows} predictions", json)
+    _say({"written": str(out), "rows": len(values)}, f"{out}: {len(values)} predictions", json)
 
 
 def demo_command(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:

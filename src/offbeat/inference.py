@@ -33,7 +33,8 @@ def predict(
         size: trajectories at a time.
 
     Returns:
-        One trajectory of predictions per trajectory, in original units, at the asked times.
+        One trajectory of predictions per trajectory, in original units, at the asked times; its
+        channels stand in the order of the model.
 
     Raises:
         InputError: other channels than the model's, times that do not increase, or a model that
@@ -57,8 +58,8 @@ def predict(
                 Trajectory(
                     union.times[rows],
                     model.scaler.original(values[rows]),
-                    names=trajectory.names,
-                    units=trajectory.units,
+                    names=model.names,
+                    units=model.units,
                     origin=trajectory.origin,
                 )
             )

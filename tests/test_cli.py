@@ -1,0 +1,255 @@
+"""The command: what it prints, what it writes, and one clear line for every bad input."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import offbeat as ob
+from offbeat.cli import COMMANDS, main
+
+SMALL = [
+    "--model.name=gru", "--model.hidden_size=4", "--training.epochs=1", "--training.batch_size=8",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "hopper.parquet"
+    ob.save(ob.simulate("hopper", 24, 30, seed=1, progress=False), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "first"
+    parts = ["--parts.window=20", "--parts.observed_fraction=0.5"]
+    assert main(["train", str(data), str(out), *SMALL, *parts]) == 0
+    return out
+
+
+def one_line_error(capsys, *arguments) -> str:
+    """Runs the command, which must fail as bad input does; returns its one line."""
+    capsys.readouterr()
+    assert main([str(a) for a in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().splitlines()
+    lines = [line for line in lines if "%|" not in line]  # a progress bar that had begun
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("offbeat: error: ")
+    return lines[0]
+
+
+def test_help_teaches_every_command(capsys):
+    for arguments in ([], ["--help"]):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 0
+        text = capsys.readouterr().out
+        assert all(command in text for command in COMMANDS)
+        assert "offbeat train hopper.parquet" in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_describes_every_option(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    options = [line for line in text.splitlines() if line.startswith("  --")]
+    assert options
+    assert "None, default" not in text
+
+
+def test_python_m_offbeat_is_the_command():
+    found = subprocess.run(
+        [sys.executable, "-m", "offbeat", "--version"], capture_output=True, text=True, check=True
+    )
+    assert found.stdout.strip() == f"offbeat {ob.__version__}"
+
+
+def test_simulate_writes_a_data_set_and_says_so_in_json(tmp_path, capsys):
+    out = tmp_path / "walker.parquet"
+    arguments = ["--robot=walker", "--n_trajectories=3", "--rows=5", "--seed=7", "--json"]
+    assert main(["simulate", str(out), *arguments]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["meta"]["robot"] == "walker"
+    assert len(ob.load(out)) == 3
+
+
+def test_train_leaves_everything_that_a_run_needs(run):
+    assert {"config.yaml", "log.csv", "checkpoints", "model", "parts.json", "results.json"} <= {
+        path.name for path in run.iterdir()
+    }
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["model"]["hidden_size"] == 4
+    assert config["model"]["solver"] == "euler", "the resolved config names every option"
+    results = json.loads((run / "results.json").read_text())
+    assert set(results["predictors"]) == {"gru", "last_value"}
+
+
+def test_the_saved_config_trains_the_same_model_again(run, data, tmp_path):
+    out = tmp_path / "again"
+    arguments = ["train", f"--config={run / 'config.yaml'}", str(data), str(out)]
+    assert main(arguments) == 0
+    assert json.loads((out / "results.json").read_text()) == json.loads(
+        (run / "results.json").read_text()
+    )
+
+
+def test_print_config_prints_yaml_that_can_be_overridden(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "a.parquet", "out", "--model.name=ode_rnn", "--print_config"])
+    config = yaml.safe_load(capsys.readouterr().out)
+    assert config["model"]["name"] == "ode_rnn"
+    assert config["training"]["optimizer"] == "adamax"
+
+
+def test_evaluate_scores_the_part_that_was_held_out_on_the_same_cells(run, data, capsys):
+    capsys.readouterr()
+    assert main(["evaluate", str(run), str(data), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    results = json.loads((run / "results.json").read_text())
+    assert said["part"] == "test"
+    assert said["predictors"] == results["predictors"]
+    assert main(["evaluate", str(run), str(data), "--part=all"]) == 0
+    assert "part: all, 24 trajectories" in capsys.readouterr().out
+
+
+def test_predict_answers_at_asked_times_in_original_units(run, data, tmp_path):
+    out = tmp_path / "predictions.csv"
+    assert main(["predict", str(run), str(data), str(out), "--times=[0.1, 0.2]"]) == 0
+    with out.open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 24 * 2
+    assert [float(line["time"]) for line in lines[:2]] == [0.1, 0.2]
+    expected = ob.predict(ob.load_checkpoint(run), ob.load(data), times=[0.1, 0.2])
+    assert float(lines[1]["waist_qpos"]) == expected[0].values[1, expected.names.index("waist_qpos")]
+
+
+def test_predict_reads_a_csv_with_empty_cells_and_columns_in_another_order(run, data, tmp_path):
+    names = list(ob.load(data).names)
+    path = tmp_path / "log.csv"
+    rows = [[f"{0.005 * i}", *(str(0.1 * i + j) if i % 2 else "" for j in range(14))] for i in
+            range(6)]  # fmt: skip
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([["time", *reversed(names)], *rows])
+    out = tmp_path / "predictions.parquet"
+    assert main(["predict", str(run), str(path), str(out)]) == 0
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(out)
+    assert table.column_names == ["trajectory", "time", *names]
+    assert np.isfinite(table["knee_qvel"].to_numpy()).all()
+
+
+def test_predict_keeps_the_clock_of_a_log_in_nanoseconds(run, data, tmp_path):
+    names = list(ob.load(data).names)
+    start, path, out = 1_700_000_000_123_456_789, tmp_path / "log.csv", tmp_path / "out.csv"
+    with path.open("w", newline="") as file:
+        rows = [[start + 5_000_000 * i, *[0.1 * i] * 14] for i in range(4)]
+        csv.writer(file).writerows([["time_ns", *names], *rows])
+    assert main(["predict", str(run), str(path), str(out), "--times=[0.0025, 0.02]"]) == 0
+    with out.open() as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["time"]) for line in lines] == [0.0025, 0.02]
+    assert [int(line["clock_ns"]) for line in lines] == [start + 2_500_000, start + 20_000_000]
+
+
+def test_doctor_says_what_is_installed(capsys):
+    assert main(["doctor", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {"offbeat", "python", "torch", "mujoco", "torch threads"} <= set(said)
+
+
+def test_bad_input_is_one_clear_line_and_exit_code_2(run, data, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert "invalid choice: 'fly'" in one_line_error(capsys, "fly")
+    error = one_line_error(capsys, "simulate", out / "a.csv")
+    assert ".parquet" in error
+    error = one_line_error(capsys, "simulate", out / "a.parquet", "--robot=hoper")
+    assert "did you mean 'hopper'" in error
+    error = one_line_error(capsys, "train", tmp_path / "none.parquet", out)
+    assert "none.parquet" in error
+    for fraction in ("0", "1.2"):
+        error = one_line_error(capsys, "train", data, out, f"--parts.observed_fraction={fraction}")
+        assert "above 0 and at most 1" in error
+    error = one_line_error(capsys, "train", data, out, "--model.name=ode_rn")
+    assert "did you mean 'ode_rnn'" in error
+    error = one_line_error(capsys, "train", data, out, "--training.epochs=none")
+    assert "epochs" in error
+    error = one_line_error(capsys, "evaluate", tmp_path, data)
+    assert "not a checkpoint" in error
+    error = one_line_error(capsys, "predict", run, data, out / "a.xlsx")
+    assert ".csv" in error
+    error = one_line_error(capsys, "predict", run, data, out / "a.csv", "--times=[0.2, 0.1]")
+    assert "increase strictly" in error
+    assert not out.exists(), "bad input writes nothing"
+
+
+def test_a_config_with_an_unknown_key_is_refused(run, data, tmp_path, capsys):
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    config["training"]["epoks"] = 3
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(config))
+    error = one_line_error(capsys, "train", f"--config={path}", data, tmp_path / "out")
+    assert "epoks" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_data_of_other_channels_and_a_damaged_checkpoint_are_refused(run, data, tmp_path, capsys):
+    walker = tmp_path / "walker.parquet"
+    ob.save(ob.simulate("walker", 3, 30, progress=False), walker)
+    error = one_line_error(capsys, "evaluate", run, walker)
+    assert "the model was made for" in error
+    copy = tmp_path / "copy"
+    ob.save_checkpoint(ob.load_checkpoint(run), copy)
+    damaged = bytearray((copy / "model.safetensors").read_bytes())
+    damaged[-5] ^= 1
+    (copy / "model.safetensors").write_bytes(bytes(damaged))
+    assert "damaged" in one_line_error(capsys, "evaluate", copy, data)
+
+
+def test_times_that_do_not_increase_are_named_with_row_and_values(run, data, tmp_path, capsys):
+    names = ob.load(data).names
+    for times, said in (
+        (("0.0", "0.2", "0.1"), ("0.2", "0.1")),
+        (("0.0", "nan", "0.1"), ("time",)),
+        (("0.0", "inf", "0.1"), ("inf",)),
+    ):
+        path = tmp_path / "log.csv"
+        with path.open("w", newline="") as file:
+            csv.writer(file).writerows([["time", *names], *([t, *[1.0] * 14] for t in times)])
+        error = one_line_error(capsys, "predict", run, path, tmp_path / "out.csv")
+        assert all(word in error for word in said), error
+
+
+def test_a_channel_that_is_never_observed_is_named(tmp_path, capsys):
+    path = tmp_path / "log.csv"
+    with path.open("w", newline="") as file:
+        rows = [[e, 0.1 * i, i, ""] for e in range(10) for i in range(5)]
+        csv.writer(file).writerows([["episode", "time", "knee", "ankle"], *rows])
+    error = one_line_error(capsys, "train", path, tmp_path / "out", *SMALL)
+    assert "never observed" in error
+    assert "ankle" in error
+
+
+def test_a_missing_extra_is_named_by_its_extra(tmp_path):
+    """A sitecustomize-like block of `mujoco` stands for a machine without it."""
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from offbeat.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code, "simulate", str(tmp_path / "a.parquet")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert found.returncode == 2
+    assert "pip install 'offbeat[sim]'" in found.stderr
+    assert len(found.stderr.strip().splitlines()) == 1
+    assert not list(Path(tmp_path).iterdir())
