@@ -3,9 +3,9 @@
     python benchmarks/calibration.py --model ode_rnn --observed_fraction 0.3 --epochs 50
 
 Data, windows, masks, split, normalisation, models and training follow chapter 3 of the thesis: the
-draw of the public generator (seed 123), a window of 100 of 200 rows per trajectory, `divide_by_max`
-over all rows, 70/15/15 by trajectory, batches of 50. The anchored model trains with Adam 0.002,
-cosine decay and gradients clipped at norm 1 on 100 times the MSE. A killed run goes on where it was.
+draw of the public generator (seed 123), a window of 100 of 200 rows per trajectory,
+`divide_by_max` over all rows, 70/15/15 by trajectory, batches of 50. The anchored model trains with
+its own optimizer (`offbeat.train_config`). A killed run goes on where it was.
 """
 
 from __future__ import annotations

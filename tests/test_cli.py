@@ -129,7 +129,9 @@ def test_predict_answers_at_asked_times_in_original_units(run, data, tmp_path):
     assert len(lines) == 24 * 2
     assert [float(line["time"]) for line in lines[:2]] == [0.1, 0.2]
     expected = ob.predict(ob.load_checkpoint(run), ob.load(data), times=[0.1, 0.2])
-    assert float(lines[1]["waist_qpos"]) == expected[0].values[1, expected.names.index("waist_qpos")]
+    assert (
+        float(lines[1]["waist_qpos"]) == expected[0].values[1, expected.names.index("waist_qpos")]
+    )
 
 
 def test_predict_reads_a_csv_with_empty_cells_and_columns_in_another_order(run, data, tmp_path):

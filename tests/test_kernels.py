@@ -73,9 +73,7 @@ def test_the_fastest_body_that_can_is_the_one_that_runs(name, monkeypatch):
     for body in (written_out, reference):
         original = body.scan
         label = body.__name__.rsplit(".", 1)[-1]
-        monkeypatch.setattr(
-            body, "scan", lambda *a, o=original, w=label: (ran.append(w), o(*a))[1]
-        )
+        monkeypatch.setattr(body, "scan", lambda *a, o=original, w=label: (ran.append(w), o(*a))[1])
     model, batch = made(name, {})
     model(batch)
     assert ran == ["reference" if name in ("rnn", "lstm") else "written_out"]

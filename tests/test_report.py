@@ -75,7 +75,7 @@ def test_the_axes_of_learning_curves_say_what_they_count_and_in_which_units():
         0
     ]
     assert axes.get_xlabel() == "Optimizer steps"
-    assert axes.get_ylabel() == "Validation RMSE, honest (standard deviations)"
+    assert axes.get_ylabel() == "Honest validation RMSE (deviations)"
     assert figures.learning_curves({"gru": log(0.5)}).axes[0].get_xlabel() == "Epoch"
 
 
@@ -119,6 +119,19 @@ def test_a_panel_shows_truth_observed_points_and_each_prediction():
     np.testing.assert_array_equal(drawn["Observed"].get_xdata(), truth.times[seen])
     np.testing.assert_array_equal(drawn["Observed"].get_ydata(), truth.values[seen, 1])
     assert drawn["Observed"].get_linestyle() == "None"
+
+
+def test_what_a_model_says_before_it_has_seen_anything_does_not_set_the_height_of_a_panel():
+    truth = swing(hide=[0, 1])
+    values = truth.values.copy()
+    values[:3] = -100.0  # row 2 is the first observed one: its own prediction has seen nothing
+    values[10] = 9.0
+    guess = Trajectory(truth.times, values, names=truth.names, units=truth.units)
+    axes = figures.predictions(truth, {"gru": guess}, ["mode"]).axes[0]
+    low, high = axes.get_ylim()
+    assert -2 < low < 0
+    assert 9 < high < 11
+    np.testing.assert_array_equal(lines(axes)["GRU"].get_ydata(), values[:, 2])
 
 
 def test_a_model_has_one_colour_in_all_figures():
@@ -303,9 +316,7 @@ def test_an_animation_of_what_does_not_fit_is_refused(tmp_path, options, said):
 
 def test_positions_of_another_robot_or_not_finite_are_refused(tmp_path):
     times, good = np.arange(2) * 0.005, np.zeros((2, 7))
-    with pytest.raises(
-        InputError, match=r"predicted_qpos must have shape \(rows, 7\), got \(2, 9\)"
-    ):
+    with pytest.raises(InputError, match=r"predicted_qpos must have shape \(rows, 7\)"):
         animation.side_by_side("hopper", good, np.zeros((2, 9)), tmp_path / "a.gif", times=times)
     bad = np.where(np.arange(2)[:, None] == 1, np.nan, good)
     with pytest.raises(InputError, match="truth_qpos is not finite at row 1"):

@@ -90,7 +90,11 @@ def test_cosine_decay_ends_near_zero_and_clipping_bounds_an_sgd_step():
 def test_the_log_has_a_line_per_epoch_with_the_validation_scores(tmp_path):
     model = ob.make("gru", TRAIN, **SMALL)
     result = ob.fit(
-        model, TRAIN, VALIDATION, ob.TrainConfig(epochs=3, batch_size=5), out=tmp_path / "run",
+        model,
+        TRAIN,
+        VALIDATION,
+        ob.TrainConfig(epochs=3, batch_size=5),
+        out=tmp_path / "run",
         progress=False,
     )
     with (tmp_path / "run" / "log.csv").open() as file:
@@ -194,7 +198,7 @@ def test_another_run_in_the_same_folder_is_refused_and_nothing_is_lost(tmp_path)
     ob.fit(model, TRAIN, config=config, out=tmp_path, progress=False)
     before = weights(ob.load_checkpoint(tmp_path))
     other = ob.TrainConfig(epochs=1, batch_size=4, learning_rate=0.5)
-    with pytest.raises(ob.InputError, match="learning_rate \\(0.001 then, 0.5 now\\)"):
+    with pytest.raises(ob.InputError, match=r"learning_rate \(0.001 then, 0.5 now\)"):
         ob.fit(ob.make("gru", TRAIN, **SMALL), TRAIN, config=other, out=tmp_path, progress=False)
     with pytest.raises(ob.InputError, match="training set"):
         ob.fit(
@@ -224,7 +228,7 @@ def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkp
     monkeypatch.setattr(training, "_step", poisoned)
     model = ob.make("gru", TRAIN, **SMALL)
     config = ob.TrainConfig(epochs=5, batch_size=4)
-    with pytest.raises(ob.DivergenceError, match="nan in epoch 3, step 2.*last good checkpoint"):
+    with pytest.raises(ob.DivergenceError, match=r"nan in epoch 3, step 2.*last good checkpoint"):
         ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     kept = sorted((tmp_path / "checkpoints").iterdir())
     assert [folder.name for folder in kept] == ["steps-000000006"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json as json_
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -167,7 +167,9 @@ def evaluate_command(
     result = {"part": part, **evaluation.to_dict()}
     if out is not None:
         write_json(out, result)
-    heading = f"RMSE in scaled units ({evaluation.scaler}), part: {part}, {len(dataset)} trajectories"
+    heading = (
+        f"RMSE in scaled units ({evaluation.scaler}), part: {part}, {len(dataset)} trajectories"
+    )
     _say(result, f"{heading}\n{evaluation.table()}", json)
 
 
@@ -253,7 +255,7 @@ def doctor_command(json: bool = False) -> None:
 
 # The functions are not named after the commands: jsonargparse would find their namesakes in the
 # lazy package `offbeat`, and import torch to look at them.
-COMMANDS: dict[str, Callable[..., None]] = {
+COMMANDS: dict[str, Any] = {
     "simulate": simulate_command,
     "train": train_command,
     "evaluate": evaluate_command,

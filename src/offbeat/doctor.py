@@ -22,7 +22,9 @@ def examine() -> dict[str, Any]:
         "offbeat": __version__,
         "python": f"{platform.python_version()} ({sys.executable})",
         "platform": platform.platform(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
         "torch threads": torch.get_num_threads(),
         "torch CUDA": torch.cuda.is_available(),
         "scan bodies": "written out (GRU, one Euler step), reference (everything)",

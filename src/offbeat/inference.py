@@ -47,9 +47,7 @@ def predict(
     coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
     for first in range(0, len(dataset), size):
         part = dataset[first : first + size]
-        merged = [
-            _merge(t, at) for t, at in zip(part, asked[first : first + size], strict=True)
-        ]
+        merged = [_merge(t, at) for t, at in zip(part, asked[first : first + size], strict=True)]
         batch = model.batch(Dataset(tuple(t for t, _ in merged)))
         with torch.inference_mode():
             scaled = model(batch, coins=coins).predictions.double().numpy()

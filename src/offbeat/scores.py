@@ -147,7 +147,8 @@ class ScoreSums:
             GapScore(unit * 2.0 ** (k - 1) if k else 0.0, unit * 2.0**k, self._score(k))
             for k in groups
         )
-        return Scores(*(self._score(name) for name in SCORINGS), by_gap=by_gap)
+        named = {name: self._score(name) for name in SCORINGS}
+        return Scores(**named, by_gap=by_gap)
 
     def _score(self, name: str | int) -> Score:
         if name not in self._sums:
@@ -173,7 +174,7 @@ def last_value_predictions(batch: Batch, mean: Tensor) -> Tensor:
 
 
 def row_0_constant(batch: Batch) -> float:
-    """c of `published = (1 - 1/rows) rows_1_99 + c (hidden share of rows 0) / rows`.
+    """The c of `published = (1 - 1/rows) rows_1_99 + c (hidden share of rows 0) / rows`.
 
     The mean square of those rows 0 that are hidden, for whole rows hidden and equal lengths.
     """
@@ -189,7 +190,7 @@ def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None)
         notes: a remark per predictor, shown at the end of its line.
     """
     titles = ("predictor", "honest RMSE", "hidden only", "rows 1-99", "published")
-    lines = [titles]
+    lines: list[tuple[str, ...]] = [titles]
     ranked = sorted(rows.items(), key=lambda item: item[1].honest.mse)
     for name, scores in ranked:
         numbers = (f"{getattr(scores, s).rmse:.4f}" for s in SCORINGS)

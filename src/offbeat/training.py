@@ -199,11 +199,10 @@ def _epoch(
         if state.step % 10 == 0:
             mean = state.loss_sum / state.step
             bar.set_description(f"epoch {state.epoch + 1}/{config.epochs} loss {mean:.3g}")
-        inside = state.step < steps
-        if folder and inside and config.checkpoint_every:
-            if state.step % config.checkpoint_every == 0:
-                _check_weights(model, state, folder)
-                _save(folder, model, state, identity)
+        due = config.checkpoint_every and state.step % config.checkpoint_every == 0
+        if folder and due and state.step < steps:
+            _check_weights(model, state)
+            _save(folder, model, state, identity)
     state.seconds = done_before + time.perf_counter() - started
 
 
@@ -225,7 +224,7 @@ def _step(
             "last good checkpoint is kept: lower the learning rate, or clip gradients (clip_norm)"
         )
     state.optimizer.zero_grad(set_to_none=True)
-    (loss * config.loss_scale).backward()  # type: ignore[no-untyped-call]
+    (loss * config.loss_scale).backward()
     if config.clip_norm is not None:
         torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm, foreach=True)
     if config.schedule == "cosine":
@@ -243,7 +242,7 @@ def _close_epoch(
     state: _State,
     config: TrainConfig,
 ) -> None:
-    _check_weights(model, state, None)
+    _check_weights(model, state)
     scores = validate(model, held_out, seed=config.seed) if held_out is not None else None
     if scores is not None and not math.isfinite(scores.rows_1_99.mse) and scores.rows_1_99.cells:
         raise DivergenceError(
@@ -270,7 +269,7 @@ def _close_epoch(
     state.step, state.loss_sum, state.seconds = 0, 0.0, 0.0
 
 
-def _check_weights(model: RecurrentModel, state: _State, folder: Path | None) -> None:
+def _check_weights(model: RecurrentModel, state: _State) -> None:
     if not all(bool(torch.isfinite(p).all()) for p in model.parameters()):
         raise DivergenceError(
             f"a weight left the finite numbers in epoch {state.epoch + 1}, step {state.step}; the "
@@ -311,9 +310,7 @@ def _identity(model: RecurrentModel, config: TrainConfig, batch: Batch) -> dict[
     return plain
 
 
-def _save(
-    folder: Path, model: RecurrentModel, state: _State, identity: dict[str, Any]
-) -> None:
+def _save(folder: Path, model: RecurrentModel, state: _State, identity: dict[str, Any]) -> None:
     tensors = {f"best.{k}": v for k, v in state.best.items()}
     for i, parameter in enumerate(model.parameters()):
         for name, value in state.optimizer.state.get(parameter, {}).items():
@@ -341,9 +338,7 @@ def _save(
             shutil.rmtree(old)
 
 
-def _resume(
-    folder: Path, model: RecurrentModel, state: _State, identity: dict[str, Any]
-) -> None:
+def _resume(folder: Path, model: RecurrentModel, state: _State, identity: dict[str, Any]) -> None:
     checkpoints = sorted((folder / "checkpoints").glob("steps-*"))
     if not checkpoints:
         return
@@ -364,10 +359,9 @@ def _resume(
     for name in ("epoch", "step", "total_steps", "loss_sum", "seconds", "best_epoch"):
         setattr(state, name, facts[name])
     state.best_mse = math.inf if facts["best_mse"] is None else facts["best_mse"]
-    state.history = [
-        EpochRecord(**{k: math.nan if v is None else v for k, v in record.items()})
-        for record in facts["history"]
-    ]
+    for record in facts["history"]:
+        fields_: dict[str, Any] = {k: math.nan if v is None else v for k, v in record.items()}
+        state.history.append(EpochRecord(**fields_))
     _write_log(folder, state.history)
 
 
@@ -393,7 +387,7 @@ def _tensorboard(folder: Path | None, state: _State) -> Any:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
         return None
-    return SummaryWriter(str(folder / "tensorboard"), purge_step=state.epoch + 1)  # type: ignore[no-untyped-call]
+    return SummaryWriter(str(folder / "tensorboard"), purge_step=state.epoch + 1)
 
 
 @contextmanager

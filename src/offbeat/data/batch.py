@@ -105,7 +105,9 @@ class Batch:
         """The rows from `start` up to, not including, `stop`, times unchanged."""
         return Batch(**{f.name: getattr(self, f.name)[:, start:stop] for f in fields(self)})
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Batch:
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Batch:
         """Moves all tensors, and casts `values`; times stay float64."""
         moved = {f.name: getattr(self, f.name).to(device) for f in fields(self)}
         batch = Batch(**moved)

@@ -148,7 +148,7 @@ class Trajectory:
     @property
     def channels(self) -> int:
         """Number of channels."""
-        return self.values.shape[1]
+        return int(self.values.shape[1])
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -265,7 +265,7 @@ class Dataset(Sequence[Trajectory]):
         digest = hashlib.sha256("\0".join(self.names).encode())
         for trajectory in self:
             for array in (trajectory.times, trajectory.values, trajectory.observed):
-                digest.update(np.ascontiguousarray(array))
+                digest.update(array.tobytes())
         return digest.hexdigest()
 
     def select(self, names: Sequence[str]) -> Dataset:

@@ -42,5 +42,5 @@ def scan(
         Two tensors (rows, batch, state_size): the state carried to each row, before anything is
         observed there, and the state after the row.
     """
-    body = written_out if written_out.supports(spec, rows) else reference
-    return body.scan(spec, weights, rows, state)
+    body = written_out.scan if written_out.supports(spec, rows) else reference.scan
+    return body(spec, weights, rows, state)

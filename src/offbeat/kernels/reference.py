@@ -1,6 +1,6 @@
 """The reference body of the scan, in PyTorch: the loop over rows, written once.
 
-    decay -> flow over the gap -> (predictions are read here) -> cell at an observation
+decay -> flow over the gap -> (predictions are read here) -> cell at an observation
 """
 
 from __future__ import annotations
@@ -9,18 +9,18 @@ from collections.abc import Sequence
 from typing import cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.functional import linear, silu
 
 from offbeat.kernels.spec import (
     LARGEST_EXPONENT,
-    DecayRows,
     Layers,
     ScanRows,
     ScanSpec,
     ScanWeights,
 )
 from offbeat.solvers import Field, solve, tableau
+
 
 def scan(
     spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor
@@ -57,9 +57,9 @@ def scan(
 
 def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
     """Applies linear layers with a nonlinearity between them, none after the last."""
-    nonlinearity = torch.tanh if activation == "tanh" else F.silu
+    nonlinearity = torch.tanh if activation == "tanh" else silu
     for i, (weight, bias) in enumerate(layers):
-        x = F.linear(x, weight, bias)
+        x = linear(x, weight, bias)
         if i < len(layers) - 1:
             x = nonlinearity(x)
     return x
@@ -96,7 +96,7 @@ def _fed_gate(
         raise ValueError("self-feeding needs ScanWeights.feed and ScanRows.fed_gates")
     hidden = state[:, spec.anchored : spec.anchored + spec.hidden_size]
     decoded = perceptron(weights.decoder, hidden, "tanh")
-    return rows.fed_gates[i] + F.linear(decoded, weights.feed)
+    return rows.fed_gates[i] + linear(decoded, weights.feed)
 
 
 # --- over the gap ---------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from typing import Literal
 
 from torch import Tensor
 
-
 LARGEST_EXPONENT = 30.0
 """Decay exponents end here: exp(-30) is nothing beside any state, and exp(30) is still finite."""
 

@@ -42,9 +42,7 @@ class Carry:
     coins: torch.Generator | None = None
 
     @classmethod
-    def empty(
-        cls, state: Tensor, mean: Tensor, *, coins: torch.Generator | None = None
-    ) -> Carry:
+    def empty(cls, state: Tensor, mean: Tensor, *, coins: torch.Generator | None = None) -> Carry:
         """Nothing seen yet.
 
         Args:

@@ -144,7 +144,9 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FileFormatError(f"{path / CONFIG} is damaged ({error})") from None
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
-        raise FileFormatError(f"{path / CONFIG} is not an Offbeat checkpoint (no format {FORMAT!r})")
+        raise FileFormatError(
+            f"{path / CONFIG} is not an Offbeat checkpoint (no format {FORMAT!r})"
+        )
     if facts.get("version") != VERSION:
         raise FileFormatError(
             f"{path} is of checkpoint version {facts.get('version')!r}, this Offbeat reads "

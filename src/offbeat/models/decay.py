@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.functional import linear, softplus
 
 from offbeat.kernels import LARGEST_EXPONENT, DecayRows
 from offbeat.models.ages import Ages
@@ -27,7 +27,7 @@ class TrainableDecay(nn.Module):
         """(batch, rows, hidden) exponents at the start and the end of each row's gap."""
         dtype = self.weight.dtype
         start, end = ((d / unit).to(dtype) for d in (ages.delta_before, ages.delta))
-        return F.linear(start, self.weight, self.bias), F.linear(end, self.weight, self.bias)
+        return linear(start, self.weight, self.bias), linear(end, self.weight, self.bias)
 
 
 class ExponentialDecay(nn.Module):
@@ -45,7 +45,7 @@ class ExponentialDecay(nn.Module):
 
     def exponents(self, ages: Ages, unit: float) -> tuple[Tensor, Tensor]:
         """(batch, rows, hidden) exponents at the start and the end of each row's gap."""
-        tau = F.softplus(self.raw_tau).expand(self.hidden_size)
+        tau = softplus(self.raw_tau).expand(self.hidden_size)
         start, end = (
             (e / unit).to(tau.dtype)[..., None] * tau for e in (ages.elapsed_before, ages.elapsed)
         )
@@ -64,7 +64,9 @@ class InputDecay(nn.Module):
         self.weight = nn.Parameter(torch.empty(channels))
         self.bias = nn.Parameter(torch.zeros(channels))
 
-    def forward(self, values: Tensor, mask: Tensor, ages: Ages, mean: Tensor, unit: float) -> Tensor:
+    def forward(
+        self, values: Tensor, mask: Tensor, ages: Ages, mean: Tensor, unit: float
+    ) -> Tensor:
         """(batch, rows, channels) the observed value, or what is left of the last one."""
         delta = (ages.delta / unit).to(values.dtype)
         gamma = torch.exp(-(self.weight * delta + self.bias).clamp_min(0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -19,7 +21,7 @@ class Perceptron(nn.Module):
     def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
         super().__init__()
         self.activation = activation
-        pairs = list(zip(sizes, sizes[1:], strict=False))
+        pairs = list(pairwise(sizes))
         self.weights = nn.ParameterList(torch.empty(out, into) for into, out in pairs)
         self.biases = nn.ParameterList(torch.zeros(out) for _, out in pairs)
 

@@ -9,10 +9,11 @@ a stream is the same call with one row and the `Carry` of the rows before.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from offbeat.config import ModelConfig
 from offbeat.data.batch import Batch
@@ -76,6 +77,8 @@ class RecurrentModel(nn.Module):
         self.time_unit = statistics.median_gap / float(config.typical_gap or 1)
         channels, hidden = statistics.channels, int(config.hidden_size or 1)
         self.channels, self.hidden_size = channels, hidden
+        self.mean: Tensor
+        self.std: Tensor
         self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
         self.register_buffer("std", torch.tensor(statistics.std), persistent=False)
 
@@ -126,9 +129,8 @@ class RecurrentModel(nn.Module):
             for part in (self.decay, self.input_decay):
                 if isinstance(part, TrainableDecay | InputDecay):
                     part.weight.abs_()  # a negative weight of equation 26 gets no gradient
-            if self.config.init == "fan_in":
-                if self.field is not None:
-                    self.field.weights[-1].mul_(0.1)
+            if self.config.init == "fan_in" and self.field is not None:
+                self.field.weights[-1].mul_(0.1)
             if self.start is not None:
                 self.start.zero_()
 
@@ -248,7 +250,7 @@ class RecurrentModel(nn.Module):
         elif config.update_rows == "every":
             update = batch.valid
         updated = torch.cat([carry.updated[:, None], update[:, :-1]], dim=1)
-        gates = F.linear(torch.cat([shown, *context], dim=2), self.cell.inputs, self.cell.bias)
+        gates = linear(torch.cat([shown, *context], dim=2), self.cell.inputs, self.cell.bias)
         rows = ScanRows(
             gap=(at_rows.gap / unit).to(dtype)[..., None],
             update=update.to(dtype)[..., None],
@@ -258,7 +260,7 @@ class RecurrentModel(nn.Module):
         )
         if config.self_feeding:
             weight = self.cell.inputs[:, self.channels :]
-            fed = F.linear(torch.cat(context, dim=2), weight, self.cell.bias)
+            fed = linear(torch.cat(context, dim=2), weight, self.cell.bias)
             rows = replace(rows, fed_gates=fed)
         rows = _time_first(rows)
         if config.self_feeding:
@@ -272,13 +274,11 @@ class RecurrentModel(nn.Module):
 
 
 def _time_first(rows: ScanRows) -> ScanRows:
-    tensors = {f.name: getattr(rows, f.name) for f in fields(rows)}
-    moved = {
-        name: value.transpose(0, 1).contiguous()
-        for name, value in tensors.items()
-        if isinstance(value, Tensor)
-    }
-    return replace(rows, **moved)
+    moved: dict[str, Any] = {f.name: getattr(rows, f.name) for f in fields(rows)}
+    for name, value in moved.items():
+        if isinstance(value, Tensor):
+            moved[name] = value.transpose(0, 1).contiguous()
+    return ScanRows(**moved)
 
 
 def _coins(carry: Carry, rows: int, share: float) -> tuple[bool, ...]:

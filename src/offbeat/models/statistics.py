@@ -76,7 +76,9 @@ class Statistics:
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> Statistics:
         """The inverse of `to_dict`."""
-        fields = {k: tuple(v) if isinstance(v, list) else v for k, v in value.items()}
+        fields: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in value.items()
+        }
         return cls(**fields)
 
 

@@ -126,7 +126,8 @@ def train_config(name: str, **options: Any) -> TrainConfig:
             "clip_norm": 1.0,
             "loss_scale": 100.0,
         }
-    return from_mapping(TrainConfig, {**own, **options})
+    config: TrainConfig = from_mapping(TrainConfig, {**own, **options})
+    return config
 
 
 def make(

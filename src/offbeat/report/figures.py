@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
+import numpy as np
+
 from offbeat.data.trajectory import Trajectory
 from offbeat.errors import InputError, one_of
 from offbeat.files import atomic_path
@@ -85,8 +87,8 @@ def learning_curves(
         axes.set_yscale("log")
         axes.set_xlim(left=0)
         axes.set_xlabel("Epoch" if x == "epochs" else "Optimizer steps")
-        axes.set_ylabel(f"Validation RMSE, honest ({units})")
-        axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True))
+        axes.set_ylabel(f"Honest validation RMSE ({units})")
+        axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
         # An error seldom spans a decade: label 1, 2, 3, 5 of each, in plain numbers.
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -103,6 +105,9 @@ def predictions(
     title: str = "",
 ) -> Figure:
     """Draws channels over time: the truth, what was observed of it, and what models predicted.
+
+    A panel is as high as the truth and the predictions after the channel's first observation need:
+    what a model says before it has seen anything may leave the panel.
 
     Args:
         truth: with the observed cells marked.
@@ -140,15 +145,19 @@ def _channel(
 ) -> None:
     channel = truth.names.index(name)
     observed = truth.observed[:, channel]
+    first_seen = truth.times[observed][0] if observed.any() else -np.inf
+    counted = [truth.values[:, channel]]
     black = STYLES["truth"]
     axes.plot(
         truth.times, truth.values[:, channel], color=black.colour, linewidth=1.8, label=black.label
     )
     for model, predicted in predictions.items():
         style = style_of(model)
+        values = predicted.values[:, predicted.names.index(name)]
+        counted.append(values[predicted.times > first_seen])
         axes.plot(
             predicted.times,
-            predicted.values[:, predicted.names.index(name)],
+            values,
             color=style.colour,
             linestyle=style.dash,
             linewidth=1.1,
@@ -169,6 +178,11 @@ def _channel(
     unit = truth.units[channel]
     axes.set_ylabel(f"{name} ({unit})" if unit else name)
     axes.margins(x=0.01)
+    together = np.concatenate(counted)
+    if not np.isnan(together).all():
+        low, high = np.nanmin(together), np.nanmax(together)
+        margin = 0.08 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
 
 
 def save(figure: Figure, path: str | Path) -> Path:

@@ -35,7 +35,7 @@ STYLES: dict[str, Style] = {
     "gru": Style("GRU", "#56B4E9", "o", _DOTTED),
     "gru_d": Style("GRU-D", "#E69F00", "s", _DASH_DOT),
     "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),
-    "ode_gru_d": Style("ODE-GRU-D", "#0072B2", "D", (0, (8, 1.5))),
+    "ode_gru_d": Style("ODE-GRU-D", "#0072B2", "D", (0, (6, 1.2, 1, 1.2, 1, 1.2))),
     "anchored_ode_gru_d": Style("Anchored ODE-GRU-D", "#D55E00", "o"),
     "rnn_decay": Style("RNN-Decay", "#CC79A7", "v", _DASH_DOT),
     "rnn": Style("RNN", "#999933", "P", _DOTTED),

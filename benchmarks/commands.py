@@ -1,0 +1,51 @@
+"""Wall time of the commands whose time is promised: `offbeat --help`, and the simulation.
+
+python benchmarks/commands.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+
+def seconds(arguments: list[str], repeats: int) -> float:
+    """Median wall time of `python -m offbeat` with these arguments."""
+    taken = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "offbeat", *arguments], check=True, capture_output=True
+        )
+        taken.append(time.perf_counter() - started)
+    return statistics.median(taken)
+
+
+def main() -> None:
+    """Prints a table, or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        out = str(Path(folder) / "hopper.parquet")
+        results = {
+            "--help": seconds(["--help"], options.repeats),
+            "simulate, 10,000 x 200 rows, written to disk": seconds(["simulate", out], 1),
+        }
+    if options.json:
+        print(json.dumps(results, indent=2))
+        return
+    print("| command | seconds |\n|---|---|")
+    for name, value in results.items():
+        print(f"| offbeat {name} | {value:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
