@@ -105,6 +105,14 @@ def test_the_report_tells_how_far_each_model_was_trained_and_what_was_written(ma
     assert all(name in text for name in made.written)
 
 
+def test_a_machine_can_read_the_result(made):
+    result = json.loads(json.dumps(made.to_dict(), allow_nan=False))
+    assert result["predictors"] == made.evaluation.to_dict()["predictors"]
+    assert result["training"]["gru"]["steps"] == 1
+    assert result["training"]["gru"]["under_trained"] is True
+    assert "hopper.gif" in result["written"]
+
+
 def test_a_model_trained_to_the_end_is_not_marked():
     history = (SimpleNamespace(steps=7000, seconds=60.0),)
     training = demo.Training(history, 7000)

@@ -192,6 +192,21 @@ def test_a_finished_run_is_not_trained_again(tmp_path):
     assert (tmp_path / "log.csv").read_bytes() == log
 
 
+def test_a_run_can_be_trained_for_longer_and_ends_as_one_that_was_planned_so(tmp_path):
+    planned = ob.make("gru", TRAIN, **SMALL)
+    ob.fit(planned, TRAIN, config=ob.TrainConfig(epochs=3, batch_size=4), progress=False)
+    for epochs in (2, 3):
+        longer = ob.make("gru", TRAIN, **SMALL)
+        config = ob.TrainConfig(epochs=epochs, batch_size=4)
+        ob.fit(longer, TRAIN, config=config, out=tmp_path, progress=False)
+    assert same(weights(planned), weights(longer))
+    with pytest.raises(ob.InputError, match="3 epochs already, 2 were asked for"):
+        ob.fit(
+            longer, TRAIN, config=ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path,
+            progress=False,
+        )  # fmt: skip
+
+
 def test_another_run_in_the_same_folder_is_refused_and_nothing_is_lost(tmp_path):
     config = ob.TrainConfig(epochs=1, batch_size=4)
     model = ob.make("gru", TRAIN, **SMALL)

@@ -129,6 +129,25 @@ class DemoResult:
         ]
         return "\n".join(lines)
 
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form."""
+        return {
+            "folder": str(self.folder),
+            **self.evaluation.to_dict(),
+            "training": {
+                name: {
+                    "steps": training.steps,
+                    "full_steps": training.full_steps,
+                    "seconds": training.seconds,
+                    "under_trained": training.under_trained,
+                }
+                for name, training in self.trainings.items()
+            },
+            "written": list(self.written),
+            "messages": list(self.messages),
+            "seconds": self.seconds,
+        }
+
 
 def run_demo(
     out: str | Path = "runs/demo",

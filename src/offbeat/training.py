@@ -130,6 +130,11 @@ def fit(
     identity = _identity(model, config, batch)
     if folder is not None:
         _resume(folder, model, state, identity)
+        if state.epoch > config.epochs:
+            raise InputError(
+                f"{folder} holds a run of {state.epoch} epochs already, {config.epochs} were asked "
+                "for; give another folder"
+            )
     stopped = _stopped(state, config)
     writer = _tensorboard(folder, state)
     with _progress_bar(state, config, len(batch), progress) as bar:
@@ -299,13 +304,15 @@ def _stopped(state: _State, config: TrainConfig) -> bool:
 
 def _identity(model: RecurrentModel, config: TrainConfig, batch: Batch) -> dict[str, Any]:
     """What must be the same for a run to go on: anything else would end in other numbers."""
-    identity = {
+    identity: dict[str, Any] = {
         "model": asdict(model.config),
         "train": asdict(config),
         "trajectories": len(batch),
         "observed_cells": int(batch.mask.sum()),
         "checksum": float(batch.values.double().sum() + batch.times.sum()),
     }
+    if config.schedule == "constant":
+        identity["train"].pop("epochs")  # such a run can be trained for longer
     plain: dict[str, Any] = json.loads(json.dumps(identity))  # lists for tuples, as it is read back
     return plain
 

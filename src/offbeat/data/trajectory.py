@@ -62,10 +62,20 @@ class Trajectory:
                 "it needs at least one of each, leave it out"
             )
         _check_times(times, where)
+        names = tuple(self.names) or tuple(f"channel_{i}" for i in range(values.shape[1]))
+        units = tuple(self.units) or ("",) * len(names)
+        if len(names) != values.shape[1] or len(units) != values.shape[1]:
+            raise InputError(
+                f"got {len(names)} names and {len(units)} units for {values.shape[1]} "
+                f"channels{where}; give one of each per channel"
+            )
+        if len(set(names)) != len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"the channel name {twice!r} stands twice{where}; names are unique")
         if np.isinf(values).any():
             row, channel = np.argwhere(np.isinf(values))[0]
             raise InputError(
-                f"values{where} are infinite at row {row}, channel {channel}; "
+                f"values{where} are infinite at row {row}, channel {names[channel]!r}; "
                 "use NaN for a cell that is not known"
             )
         known = ~np.isnan(values)
@@ -78,19 +88,10 @@ class Trajectory:
         if (observed & ~known).any():
             row, channel = np.argwhere(observed & ~known)[0]
             raise InputError(
-                f"observed{where} is True at row {row}, channel {channel}, where the value is NaN; "
+                f"observed{where} is True at row {row}, channel {names[channel]!r}, where the "
+                "value is NaN; "
                 "a cell that is not known can't be observed"
             )
-        names = tuple(self.names) or tuple(f"channel_{i}" for i in range(values.shape[1]))
-        units = tuple(self.units) or ("",) * len(names)
-        if len(names) != values.shape[1] or len(units) != values.shape[1]:
-            raise InputError(
-                f"got {len(names)} names and {len(units)} units for {values.shape[1]} "
-                f"channels{where}; give one of each per channel"
-            )
-        if len(set(names)) != len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"the channel name {twice!r} stands twice{where}; names are unique")
         actions = None if self.actions is None else _array(self.actions, "actions", where)
         if actions is not None and (actions.ndim != 2 or len(actions) != len(times)):
             raise InputError(
@@ -223,6 +224,11 @@ class Dataset(Sequence[Trajectory]):
                     f"trajectory {i} has channels {_list(other)}, the first one has "
                     f"{_list(first)}; a data set holds trajectories of the same channels"
                 )
+            if _width(other.actions) != _width(first.actions):
+                raise InputError(
+                    f"trajectory {i} has {_width(other.actions)} actions, the first one has "
+                    f"{_width(first.actions)}; a data set holds trajectories of the same actions"
+                )
         object.__setattr__(self, "trajectories", trajectories)
         object.__setattr__(self, "meta", dict(self.meta))
 
@@ -294,6 +300,10 @@ class Dataset(Sequence[Trajectory]):
             f"Dataset({len(self)} trajectories, {rows} rows, {self.channels} channels, "
             f"{100 * share:.0f} % observed)"
         )
+
+
+def _width(actions: NDArray[np.float64] | None) -> int:
+    return 0 if actions is None else int(actions.shape[1])
 
 
 def _list(trajectory: Trajectory) -> str:

@@ -1,0 +1,117 @@
+"""Trajectories and data sets are checked when they are made."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import offbeat as ob
+
+TIMES = np.array([0.0, 0.1, 0.3])
+VALUES = np.array([[1.0, 2.0], [np.nan, 3.0], [4.0, np.nan]])
+
+
+def test_known_and_observed_differ():
+    observed = np.array([[True, False], [False, True], [True, False]])
+    one = ob.Trajectory(TIMES, VALUES, observed)
+    assert np.array_equal(one.known, ~np.isnan(VALUES))
+    assert np.array_equal(one.observed, observed)
+    assert np.array_equal(ob.Trajectory(TIMES, VALUES).observed, one.known)
+    assert (one.rows, one.channels) == (3, 2)
+
+
+def test_a_trajectory_cannot_be_changed():
+    one = ob.Trajectory(TIMES, VALUES)
+    for array in (one.times, one.values, one.observed):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+    with pytest.raises(AttributeError):
+        one.names = ("a", "b")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"times": [0.0, np.nan, 0.2]}, "finite seconds, got nan at row 1"),
+        ({"times": [0.0, np.inf, 0.2]}, "finite seconds, got inf at row 1"),
+        ({"times": [0.0, 0.2, 0.1]}, r"got np.float64\(0.2\) at row 1 and .*0.1.* at row 2"),
+        ({"times": [0.0, 0.0, 0.1]}, "must increase strictly"),
+        ({"times": [0.0, 0.1]}, r"values .*2 rows, as times has, got shape \(3, 2\)"),
+        ({"times": [[0.0], [0.1], [0.2]]}, r"shape \(rows,\)"),
+        ({"times": ["a", "b", "c"]}, "times must be numbers"),
+        ({"values": VALUES[:, 0]}, r"shape \(rows, channels\)"),
+        ({"values": np.full((3, 2), np.inf)}, "infinite at row 0, channel 'channel_0'"),
+        ({"values": np.zeros((3, 0))}, "empty: 3 rows, 0 channels"),
+        ({"times": [], "values": np.zeros((0, 2))}, "empty: 0 rows"),
+        ({"observed": np.ones((3, 2), bool)}, "True at row 1, channel 'channel_0', where the"),
+        ({"observed": np.ones((3, 2))}, "observed must be bool"),
+        ({"names": ("a", "a")}, "'a' stands twice"),
+        ({"names": ("a",)}, "1 names and 1 units for 2 channels"),
+        ({"units": ("m",)}, "2 names and 1 units"),
+        ({"actions": np.zeros((2, 1))}, r"actions must have shape \(3, actions\)"),
+        ({"actions": np.full((3, 1), np.nan)}, "actions are not finite at row 0"),
+    ],
+)
+def test_what_is_wrong_is_said_with_what_was_got_and_where(fields, message):
+    with pytest.raises(ob.InputError, match=message):
+        ob.Trajectory(**{"times": TIMES, "values": VALUES, **fields})
+
+
+def test_messages_name_the_origin():
+    with pytest.raises(ob.InputError, match="of run 7"):
+        ob.Trajectory(TIMES[::-1], VALUES, origin="run 7")
+
+
+@pytest.mark.parametrize(("unit", "per_second"), [("s", 1), ("ms", 10**3), ("us", 10**6)])
+def test_times_in_any_unit_give_the_same_trajectory(unit, per_second):
+    seconds = np.array([0.0, 0.125, 0.5])
+    one = ob.Trajectory.from_arrays(seconds * per_second, VALUES, time_unit=unit)
+    assert np.array_equal(one.times, seconds)
+
+
+@given(st.integers(0, 2**60), st.lists(st.integers(1, 10**10), min_size=2, max_size=2))
+def test_an_integer_clock_loses_no_nanosecond(start, steps):
+    ticks = np.array([start, start + steps[0], start + sum(steps)])
+    one = ob.Trajectory.from_arrays(ticks, VALUES, time_unit="ns")
+    assert np.array_equal(np.rint(one.times * 1e9).astype(int), ticks - start)
+
+
+def test_an_unknown_unit_of_time_is_refused_with_the_choices():
+    with pytest.raises(ob.InputError, match="one of: ms, ns, s, us"):
+        ob.Trajectory.from_arrays(TIMES, VALUES, time_unit="sec")
+
+
+def test_a_data_set_holds_trajectories_of_the_same_channels_and_actions():
+    one = ob.Trajectory(TIMES, VALUES, names=("a", "b"))
+    for other, message in (
+        (ob.Trajectory(TIMES, VALUES), "trajectory 1 has channels channel_0"),
+        (ob.Trajectory(TIMES, VALUES, names=("a", "b"), units=("m", "")), r"a \[m\]"),
+        (ob.Trajectory(TIMES, VALUES, names=("a", "b"), actions=np.zeros((3, 2))), "2 actions"),
+    ):
+        with pytest.raises(ob.InputError, match=message):
+            ob.Dataset((one, other))
+    with pytest.raises(ob.InputError, match="at least one trajectory"):
+        ob.Dataset(())
+
+
+def test_a_data_set_is_sliced_chosen_from_and_reordered():
+    many = ob.Dataset(
+        tuple(ob.Trajectory(TIMES, VALUES + i, names=("a", "b")) for i in range(4)), {"seed": 1}
+    )
+    assert len(many[1:3]) == 2
+    assert many[1:3].meta == {"seed": 1}
+    assert [float(t.values[0, 0]) for t in many.take([3, 0])] == [4.0, 1.0]
+    swapped = many.select(("b", "a"))
+    assert swapped.names == ("b", "a")
+    assert np.array_equal(swapped[0].values, VALUES[:, ::-1], equal_nan=True)
+    with pytest.raises(ob.InputError, match="unknown channel 'c'"):
+        many.select(("c",))
+
+
+def test_fingerprints_are_equal_for_equal_data_alone():
+    def made(values=VALUES, times=TIMES, observed=None):
+        return ob.Dataset((ob.Trajectory(times, values, observed),)).fingerprint()
+
+    assert made() == made()
+    hidden = ~np.isnan(VALUES) & np.array([[True, False]] * 3)
+    assert len({made(), made(VALUES * 2), made(times=TIMES * 2), made(observed=hidden)}) == 4
