@@ -41,6 +41,7 @@ def main(
     seed: int = 0,
     n_trajectories: int = 10_000,
     threads: int = 1,
+    clock: str = "first_row",
     out: Path = Path("runs/calibration"),
 ) -> None:
     """Trains one model of the protocol and scores it on the test part.
@@ -52,6 +53,8 @@ def main(
         seed: of windows, masks, split, weights and batches.
         n_trajectories: 10,000 in the protocol.
         threads: of torch.
+        clock: when the state of a thesis model begins to move: first_row, as the thesis has it, or
+            first_observation, the default elsewhere.
         out: folder; the run goes to a subfolder of it.
     """
     torch.set_num_threads(threads)
@@ -59,9 +62,10 @@ def main(
         observed_fraction, n_trajectories=n_trajectories, seed=seed
     )
     thesis = model in ob.THESIS_MODELS
-    config = ob.thesis_config(model) if thesis else ob.ModelConfig(name=model)
+    config = ob.thesis_config(model, clock=clock) if thesis else ob.ModelConfig(name=model)
     made = ob.make(config, train, scaler=scaler, seed=seed)
-    folder = out / f"{model}-{round(100 * observed_fraction)}-{epochs}"
+    name = f"{model}-{round(100 * observed_fraction)}-{epochs}"
+    folder = out / (f"{name}-{clock}" if thesis and clock != "first_row" else name)
     started = time.perf_counter()
     fitted = ob.fit(made, train, validation, ob.train_config(model, epochs=epochs), out=folder)
     evaluation = ob.evaluate({model: made}, test)
@@ -74,6 +78,7 @@ def main(
             "epochs": epochs,
             "steps": fitted.steps,
             "seed": seed,
+            "clock": made.config.clock,
             "n_trajectories": n_trajectories,
             "training_seconds": sum(record.seconds for record in fitted.history),
             "seconds_of_this_call": time.perf_counter() - started,

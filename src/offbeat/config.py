@@ -52,6 +52,9 @@ class ModelConfig:
         init: `normal`, weights N(0, 0.1^2) and biases 0; `fan_in`, weights N(0, 1/fan-in), biases
             0, last layer of the vector field times 0.1.
         typical_gap: model time of the median training gap; fixes the unit of model time.
+        clock: when the state begins to move: at the `first_observation`, so that a prediction does
+            not depend on where a recording happens to begin, or at the `first_row`, observed or
+            not (algorithms 2 and 3).
         gap_limit: time since the last observation saturates at this multiple of the longest one
             met in training.
     """
@@ -80,6 +83,7 @@ class ModelConfig:
     readout: Literal["target", "last_row"] | None = None
     init: Literal["normal", "fan_in"] | None = None
     typical_gap: float | None = None
+    clock: Literal["first_observation", "first_row"] | None = None
     gap_limit: float | None = None
 
     def __post_init__(self) -> None:
@@ -122,6 +126,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "age_input": ("none", "elapsed", "delta", "gap"),
     "readout": ("target", "last_row"),
     "init": ("normal", "fan_in"),
+    "clock": ("first_observation", "first_row"),
 }
 
 

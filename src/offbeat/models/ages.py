@@ -1,8 +1,8 @@
 """Ages and gaps at every row, and what carries them, with the state, to the rows that follow.
 
-Nothing moves before the first observation: the model's clock starts there. After it, time since
-the last observed row saturates at a limit, and a gap is the growth of that saturated time. So rows
-in which nothing is observed can stand anywhere and change nothing.
+By default nothing moves before the first observation: the model's clock starts there. After it,
+time since the last observed row saturates at a limit, and a gap is the growth of that saturated
+time. So rows in which nothing is observed can stand anywhere and change nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Carry:
     Attributes:
         state: (batch, state_size).
         time: (batch,) float64, s, of the last row; NaN before the first.
-        start: (batch,) float64, s, of the first observed row; +inf before it.
+        start: (batch,) float64, s, at which the clock started; +inf before.
         observed_at: (batch,) float64, s, of the last observed row; -inf before the first.
         channel_at: (batch, channels) float64, s, of each channel's last observation; -inf before.
         last: (batch, channels) last observed value of each channel; the training mean before.
@@ -96,7 +96,12 @@ class Ages:
 
 
 def ages(
-    batch: Batch, carry: Carry, *, elapsed_limit: float, delta_limit: float
+    batch: Batch,
+    carry: Carry,
+    *,
+    elapsed_limit: float,
+    delta_limit: float,
+    from_first_row: bool = False,
 ) -> tuple[Ages, Carry]:
     """Ages at each row of a batch that continues what `carry` has seen.
 
@@ -105,6 +110,7 @@ def ages(
         carry: what was seen before; its `state` and `updated` are passed on as they are.
         elapsed_limit: s, at which the time since the last observed row saturates.
         delta_limit: s, at which the age of a channel saturates.
+        from_first_row: the clock starts at the first row, observed or not.
     """
     times = batch.times
     mask = batch.mask & batch.valid[..., None]
@@ -119,7 +125,8 @@ def ages(
     before = torch.where(before.isnan(), times, before)
 
     inf = float("inf")
-    earliest = torch.where(observed, times, inf).min(dim=1).values
+    starts = batch.valid if from_first_row else observed
+    earliest = torch.where(starts, times, inf).min(dim=1).values
     start = torch.minimum(carry.start, earliest)
     clock = torch.maximum(observed_at, start[:, None])
     channel_clock = torch.maximum(channel_at, start[:, None, None])
@@ -127,7 +134,7 @@ def ages(
     elapsed_before = (before - clock).clamp(0, elapsed_limit)
     result = Ages(
         observed=observed,
-        first=observed & (times == start[:, None]),
+        first=observed & (row_index < 0) & carry.observed_at.isneginf()[:, None],
         step=times - before,
         gap=elapsed - elapsed_before,
         elapsed=elapsed,

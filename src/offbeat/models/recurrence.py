@@ -197,6 +197,7 @@ class RecurrentModel(nn.Module):
             carry,
             elapsed_limit=self.statistics.longest_elapsed * float(self.config.gap_limit or 1),
             delta_limit=self.statistics.longest_delta * float(self.config.gap_limit or 1),
+            from_first_row=self.config.clock == "first_row",
         )
         rows = self._rows(batch, at_rows, carry)
         before, after = scan(self.spec, self._weights(), rows, carry.state)

@@ -36,6 +36,7 @@ _COMMON: dict[str, Any] = {
     "readout": "target",
     "init": "normal",
     "typical_gap": 0.01,
+    "clock": "first_observation",
     "gap_limit": 4.0,
 }
 """Sizes and initial weights of the thesis (chapter 3, after Rubanova et al. 2019)."""
@@ -84,9 +85,9 @@ def resolve(config: ModelConfig) -> ModelConfig:
 def thesis_config(name: str, **options: Any) -> ModelConfig:
     """A model of the thesis under the thesis' protocol, oddities included.
 
-    Predictions are read from the last row, gamma_h compounds at every row of the grid, a plain
-    GRU is given the gap since the row before, and self-feeding, where it is on, leaves h undecayed
-    at hidden rows.
+    Predictions are read from the last row, the state moves from the first row on, gamma_h compounds
+    at every row of the grid, a plain GRU is given the gap since the row before, and self-feeding,
+    where it is on, leaves h undecayed at hidden rows.
 
     Args:
         name: `gru`, `gru_d`, `ode_rnn` or `ode_gru_d`.
@@ -96,6 +97,7 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
     feeding = bool(options.get("self_feeding"))
     protocol: dict[str, Any] = {
         "readout": "last_row",
+        "clock": "first_row",
         "decay_rows": "observed_rows" if feeding else "every_row",
     }
     if name == "gru":
