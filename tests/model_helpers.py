@@ -76,6 +76,15 @@ def small_model(
     return draw_weights(model.to(dtype), seed=seed, std=std)
 
 
+def with_growing_decays(model: RecurrentModel) -> RecurrentModel:
+    """Decays that grow with age, as at the start of training: below 0 they get no gradient."""
+    with torch.no_grad():
+        for part in (model.decay, model.input_decay):
+            for parameter in part.parameters() if part is not None else ():
+                parameter.abs_().add_(0.1)
+    return model
+
+
 def predictions(model: RecurrentModel, batch: Batch, **options: Any) -> Tensor:
     """(batch, rows, channels) without a graph, 0 at padding."""
     with torch.no_grad():

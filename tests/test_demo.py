@@ -11,6 +11,7 @@ from PIL import Image
 from offbeat import demo
 from offbeat.demo import ANCHORED, run_demo
 from offbeat.errors import InputError, MissingExtraError, OffbeatError
+from offbeat.experiment import side_by_side
 from offbeat.models.zoo import THESIS_MODELS
 from offbeat.report import animation
 
@@ -168,7 +169,7 @@ def test_a_process_that_was_killed_is_reported_with_what_to_do():
     sender.close()
     killed = SimpleNamespace(join=lambda: None, exitcode=-9)
     with pytest.raises(OffbeatError, match=r"trained 'gru' ended with exit code -9; run the same"):
-        demo._collect(SimpleNamespace(name="gru"), killed, receiver)
+        side_by_side._collect(SimpleNamespace(name="gru"), killed, receiver)
 
 
 def test_other_settings_in_the_same_folder_change_nothing(copy):

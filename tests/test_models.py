@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from model_helpers import (
     predictions,
     small_model,
     trajectory,
+    with_growing_decays,
     with_observed,
 )
 from torch import Tensor, nn
@@ -26,7 +28,6 @@ from offbeat import (
     Batch,
     Dataset,
     InputError,
-    ModelConfig,
     RecurrentModel,
     Trajectory,
     make,
@@ -46,6 +47,15 @@ def sample(*, whole_rows: bool = False, seed: int = 5) -> Dataset:
     observed[0] = True if whole_rows else FIRST_ROW
     observed[3] = observed[4] = False
     observed[5] = True if whole_rows else [False, True, True]
+    return Dataset((with_observed(one, observed),))
+
+
+def late_sample(*, whole_rows: bool = False) -> Dataset:
+    """The same with nothing observed in the first two rows."""
+    (one,) = sample(whole_rows=whole_rows)
+    observed = one.observed.copy()
+    observed[:2] = False
+    observed[2] = True if whole_rows else FIRST_ROW
     return Dataset((with_observed(one, observed),))
 
 
@@ -123,7 +133,12 @@ def plain_inputs(model: RecurrentModel, data: Dataset) -> list[tuple[bool, Tenso
     found, latest = [], None
     for time, values, mask in rows_of(model, data):
         age = 0.0 if latest is None else (time - latest) / median_gap(model)
-        found.append((bool(mask.any()), torch.cat([values, mask.double(), torch.tensor([age], dtype=torch.float64)])))
+        found.append(
+            (
+                bool(mask.any()),
+                torch.cat([values, mask.double(), torch.tensor([age], dtype=torch.float64)]),
+            )
+        )
         latest = time if mask.any() else latest
     return found
 
@@ -304,13 +319,18 @@ def gru_d_in_floats(
 @pytest.mark.parametrize("update_rows", ["observed", "every"])
 @pytest.mark.parametrize("decay_rows", ["continuous", "every_row", "observed_rows"])
 @pytest.mark.parametrize("readout", ["target", "last_row"])
+@pytest.mark.parametrize("pick", [sample, late_sample])
 def test_gru_d_is_equations_24_to_32_in_plain_floats(
-    readout: str, decay_rows: str, update_rows: str, whole_rows: bool
+    pick: Callable[..., Dataset],
+    readout: str,
+    decay_rows: str,
+    update_rows: str,
+    whole_rows: bool,
 ) -> None:
-    data = sample(whole_rows=whole_rows)
+    data = pick(whole_rows=whole_rows)
     options = {"decay_rows": decay_rows, "update_rows": update_rows, "readout": readout}
     try:
-        model = small_model("gru_d", **options)
+        model = small_model("gru_d", clock="first_row", **options)
     except InputError:
         pytest.skip("these options do not go together")
     before, after = gru_d_in_floats(model, data, decay_rows=decay_rows, update_rows=update_rows)
@@ -378,11 +398,12 @@ def ode_rnn_by_torchdiffeq(
 
 @pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize(("solver", "method"), [("euler", "euler"), ("midpoint", "midpoint")])
+@pytest.mark.parametrize("pick", [sample, late_sample])
 def test_ode_rnn_is_a_loop_over_torchdiffeq_step_by_step(
-    solver: str, method: str, steps: int
+    pick: Callable[..., Dataset], solver: str, method: str, steps: int
 ) -> None:
-    data = sample()
-    model = small_model("ode_rnn", solver=solver, steps_per_gap=steps)
+    data = pick()
+    model = small_model("ode_rnn", solver=solver, steps_per_gap=steps, clock="first_row")
     expected = ode_rnn_by_torchdiffeq(model, data, method, steps=steps)
     got, before, _ = states_of(model, data)
     assert error(before, expected) < 1e-13
@@ -446,9 +467,12 @@ def test_ode_gru_d_is_algorithm_3_where_every_row_is_observed(decay: str) -> Non
 
 
 @pytest.mark.parametrize("whole_rows", [True, False], ids=["whole_rows", "per_channel"])
-def test_ode_gru_d_of_the_thesis_compounds_gamma_h_at_every_row(whole_rows: bool) -> None:
-    """Algorithm 3 on the grid of the thesis, x-hat of equation 27, read from the row before."""
-    data = sample(whole_rows=whole_rows)
+@pytest.mark.parametrize("pick", [sample, late_sample])
+def test_ode_gru_d_of_the_thesis_compounds_gamma_h_at_every_row(
+    pick: Callable[..., Dataset], whole_rows: bool
+) -> None:
+    """Algorithm 3 on the grid of the thesis, from its first row on, read from the row before."""
+    data = pick(whole_rows=whole_rows)
     model = small_model(thesis_config("ode_gru_d"))
     weight, bias = model.decay.weight, model.decay.bias  # type: ignore[union-attr]
     w_x, b_x = model.input_decay.weight, model.input_decay.bias  # type: ignore[union-attr]
@@ -597,7 +621,11 @@ def test_self_feeding_gru_takes_its_decoded_state_where_the_coin_says_so() -> No
             gap = (time - time_before) / median_gap(model)
             shown = decoded(model, h) if fed else values
             if mask.any():
-                h = gru_by_matrices(model, h, torch.cat([shown, mask.double(), torch.tensor([gap], dtype=torch.float64)]))
+                h = gru_by_matrices(
+                    model,
+                    h,
+                    torch.cat([shown, mask.double(), torch.tensor([gap], dtype=torch.float64)]),
+                )
             time_before = time
     got = predictions(model, model.batch(data), coins=torch.Generator().manual_seed(11))
     assert error(got[0], torch.stack(expected)) < 1e-13
@@ -689,10 +717,7 @@ def tiny(name: str, **options: Any) -> tuple[RecurrentModel, Batch]:
     sizes = {"hidden_size": 2, "decoder_units": (2,), "field_units": (2,), "typical_gap": 0.3}
     model = make(name, data, **{**sizes, **options}).double()
     draw_weights(model, seed=4)
-    with torch.no_grad():
-        for part in (model.decay, model.input_decay):
-            for parameter in part.parameters() if part is not None else ():
-                parameter.abs_().add_(0.1)
+    with_growing_decays(model)
     return model, model.batch(data)
 
 
@@ -894,9 +919,7 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
     ],
     ids=lambda value: str(value)[:50] if isinstance(value, dict) else "",
 )
-def test_an_option_that_cannot_be_is_refused_by_name(
-    options: dict[str, Any], message: str
-) -> None:
+def test_an_option_that_cannot_be_is_refused_by_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make("gru", dataset(3), **options)
 

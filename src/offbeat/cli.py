@@ -235,8 +235,7 @@ def demo_command(out: Path = Path("runs/demo"), seed: int = 0, json: bool = Fals
     from offbeat.demo import run_demo
 
     result = run_demo(out, seed=seed)
-    if json:
-        _say(result.to_dict(), "", json)
+    _say(result.to_dict(), str(result), json)
 
 
 def doctor_command(json: bool = False) -> None:

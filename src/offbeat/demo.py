@@ -5,41 +5,32 @@ from __future__ import annotations
 import csv
 import io
 import json
-import multiprocessing
-import os
-import signal
-import sys
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from tqdm import tqdm
 
-from offbeat.config import TrainConfig
 from offbeat.data.prepare import Scaler, split, windows
 from offbeat.data.simulate import available_cores, simulate
-from offbeat.data.store import load, save
+from offbeat.data.store import save
 from offbeat.data.thin import thin
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.errors import InputError, MissingExtraError, OffbeatError
+from offbeat.errors import InputError, MissingExtraError
 from offbeat.evaluation import LAST_VALUE, Evaluation, evaluate
+from offbeat.experiment.side_by_side import Job, one_thread, train_side_by_side
 from offbeat.files import write_json, write_text
 from offbeat.inference import predict
 from offbeat.models.checkpoint import load_checkpoint
 from offbeat.models.recurrence import RecurrentModel
-from offbeat.models.zoo import THESIS_MODELS, make, train_config
+from offbeat.models.zoo import THESIS_MODELS, train_config
 from offbeat.report import figures
 from offbeat.report.animation import side_by_side
 from offbeat.report.style import style_of
 from offbeat.scores import SCORINGS
-from offbeat.training import EpochRecord, fit
+from offbeat.training import EpochRecord
 
 ROBOT = "hopper"
 OBSERVED_FRACTION = 0.3
@@ -208,10 +199,21 @@ def run_demo(
     write_json(out / "settings.json", settings)
     for name, part in parts.items():
         save(part, out / "data" / f"{name}.parquet")
-    jobs = {name: _Job(name, config, scaler, out) for name, config in configs.items()}
-    _train(list(jobs.values()), workers, progress)
+    data = out / "data"
+    jobs = {
+        name: Job(
+            name,
+            config,
+            scaler,
+            data / "train.parquet",
+            data / "validation.parquet",
+            out / "models" / name,
+        )
+        for name, config in configs.items()
+    }
+    train_side_by_side(list(jobs.values()), workers=workers, progress=progress)
     trainings = {name: Training(jobs[name].history(), full) for name, full in FULL_STEPS.items()}
-    with _one_thread():
+    with one_thread():
         models = {name: load_checkpoint(jobs[name].folder) for name in FULL_STEPS}
         evaluation = evaluate(models, parts["test"], seed=seed)
         _write_scores(out, evaluation, trainings)
@@ -259,119 +261,6 @@ def _check_folder(out: Path, settings: Mapping[str, Any]) -> None:
         raise InputError(
             f"{out} holds a demo with another {', '.join(other)}; give the same, or another folder"
         )
-
-
-# --- training, side by side -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Job:
-    """One model to train, in this process or in another."""
-
-    name: str
-    training: TrainConfig
-    scaler: Scaler
-    out: Path
-
-    def run(self, *, progress: bool) -> None:
-        """Trains, or goes on training; the same in any process."""
-        train, validation = (load(self.out / "data" / f"{p}.parquet") for p in _PARTS[:2])
-        model = make(self.name, train, scaler=self.scaler, seed=self.training.seed)
-        with _one_thread():
-            fit(model, train, validation, self.training, out=self.folder, progress=progress)
-
-    @property
-    def folder(self) -> Path:
-        return self.out / "models" / self.name
-
-    def history(self) -> tuple[EpochRecord, ...]:
-        """What its log holds so far."""
-        log = self.folder / "log.csv"
-        if not log.exists():
-            return ()
-        with log.open(newline="", encoding="utf-8") as file:
-            lines = list(csv.DictReader(file))
-        return tuple(
-            EpochRecord(
-                int(line.pop("epoch")),
-                int(line.pop("steps")),
-                **{name: float(value) for name, value in line.items()},
-            )
-            for line in lines
-        )
-
-
-def _train(jobs: Sequence[_Job], workers: int, progress: bool) -> None:
-    if workers == 1:
-        for job in jobs:
-            if progress:
-                print(f"training {style_of(job.name).label}", file=sys.stderr)
-            job.run(progress=progress)
-        return
-    waiting, running = list(jobs), dict[Any, tuple[_Job, Any, Any]]()
-    context = multiprocessing.get_context("spawn")  # a fork after torch has computed can hang
-    total = sum(job.training.epochs for job in jobs)
-    with tqdm(total=total, desc="training", unit="epoch", disable=not progress) as bar:
-        try:
-            while waiting or running:
-                while waiting and len(running) < workers:
-                    job = waiting.pop(0)
-                    receiver, sender = context.Pipe(duplex=False)
-                    process = context.Process(target=_run_apart, args=(job, sender), daemon=True)
-                    process.start()
-                    sender.close()
-                    running[process.sentinel] = (job, process, receiver)
-                for sentinel in connection.wait(list(running), timeout=0.5):
-                    _collect(*running.pop(sentinel))
-                new = sum(len(job.history()) for job in jobs) - bar.n
-                if new:
-                    names = ", ".join(job.name for job, _, _ in running.values())
-                    bar.set_postfix_str(names, refresh=False)
-                    bar.update(new)
-        finally:
-            for _, process, _ in running.values():
-                process.terminate()
-                process.join()
-
-
-def _run_apart(job: _Job, sender: Any) -> None:
-    """A process that trains one model; it ends with the process that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        job.run(progress=False)
-    except OffbeatError as error:
-        sender.send(error)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _collect(job: _Job, process: Any, receiver: Any) -> None:
-    process.join()
-    if receiver.poll():
-        with suppress(EOFError):  # it ended without a word
-            raise receiver.recv()
-    if process.exitcode:
-        raise OffbeatError(
-            f"the process that trained {job.name!r} ended with exit code {process.exitcode}; run "
-            "the same again, it goes on where it was (with workers=1 it needs less memory)"
-        )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Sums in one order, on any machine; and small steps are faster so."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 # --- what is left on disk -------------------------------------------------------------------------
