@@ -1,6 +1,7 @@
-"""One full-size run of the thesis' protocol, scored: the numbers of `results/calibration.md`.
+"""Full-size runs of the thesis' protocol, scored: the numbers of `results/calibration.md`.
 
-    python benchmarks/calibration.py --model ode_rnn --observed_fraction 0.3 --epochs 50
+    python benchmarks/calibration.py run --model ode_rnn --observed_fraction 0.3 --epochs 50
+    python benchmarks/calibration.py table results/calibration
 
 Data, windows, masks, split, normalisation, models and training follow chapter 3 of the thesis: the
 draw of the public generator (seed 123), a window of 100 of 200 rows per trajectory,
@@ -34,7 +35,7 @@ def protocol_data(
     return train, validation, test, scaler
 
 
-def main(
+def run(
     model: str = "ode_rnn",
     observed_fraction: float = 0.3,
     epochs: int = 50,
@@ -65,7 +66,9 @@ def main(
     config = ob.thesis_config(model, clock=clock) if thesis else ob.ModelConfig(name=model)
     made = ob.make(config, train, scaler=scaler, seed=seed)
     name = f"{model}-{round(100 * observed_fraction)}-{epochs}"
-    folder = out / (f"{name}-{clock}" if thesis and clock != "first_row" else name)
+    if thesis and clock != "first_row":
+        name += f"-{clock}"
+    folder = out / (f"{name}-seed{seed}" if seed else name)
     started = time.perf_counter()
     fitted = ob.fit(made, train, validation, ob.train_config(model, epochs=epochs), out=folder)
     evaluation = ob.evaluate({model: made}, test)
@@ -110,7 +113,38 @@ def _processor() -> str:
     return platform.processor()
 
 
-if __name__ == "__main__":
-    from jsonargparse import CLI
+def table(folder: Path) -> None:
+    """Prints a Markdown table of the results in a folder.
 
-    CLI(main)
+    Args:
+        folder: holds JSON files that `run` wrote as `result.json`, under any name.
+    """
+    titles = (
+        "run", "honest MSE (RMSE)", "hidden rows only, RMSE", "rows 1-99 MSE", "published RMSE",
+        "last value, honest RMSE", "ratio", "training", "commit",
+    )  # fmt: skip
+    print("| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
+    for path in sorted(folder.glob("*.json")):
+        result = json.loads(path.read_text(encoding="utf-8"))
+        predictors = result["scores"]["predictors"]
+        ours, trivial = predictors[result["model"]], predictors["last_value"]
+        honest = ours["honest"]
+        share = round(100 * result["observed_fraction"])
+        cells = (
+            f"{path.stem}: {result['model']}, {share} %, {result['epochs']} epochs",
+            f"{honest['mse']:.6f} ({honest['rmse']:.4f})",
+            f"{ours['honest_hidden']['rmse']:.4f}",
+            f"{ours['rows_1_99']['mse']:.5f}",
+            f"{ours['published']['rmse']:.4f}",
+            f"{trivial['honest']['rmse']:.4f}",
+            f"{honest['rmse'] / trivial['honest']['rmse']:.3f}",
+            f"{result['steps']} steps, {result['training_seconds'] / 60:.0f} min",
+            result["machine"]["commit"],
+        )
+        print("| " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    from jsonargparse import auto_cli
+
+    auto_cli([run, table])
