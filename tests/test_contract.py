@@ -285,7 +285,7 @@ def with_empty_rows(data: Dataset, *, seed: int = 0) -> tuple[Dataset, list[Any]
     random = np.random.default_rng(seed)
     made, own = [], []
     for one in data:
-        last = int(round(one.times[-1] / TICK))
+        last = round(one.times[-1] / TICK)
         free = np.setdiff1d(np.arange(-20, last + 40), np.round(one.times / TICK))
         times = np.union1d(one.times, random.choice(free, size=12, replace=False) * TICK)
         rows = np.searchsorted(times, one.times)

@@ -595,13 +595,11 @@ def test_anchored_repeats_the_last_values_where_its_field_is_zero() -> None:
         for parameter in model.field.parameters():  # type: ignore[union-attr]
             parameter.zero_()
     got, _, _ = states_of(model, data)
-    last = None
-    for i, (_, values, mask) in enumerate(rows_of(model, data)):
-        if last is not None:
-            assert error(got[i][seen], last[seen]) < 1e-6
-            last, seen = torch.where(mask, values, last), seen | mask
-        else:
-            last, seen = values, mask
+    last, seen = torch.zeros(3).double(), torch.zeros(3, dtype=torch.bool)
+    for prediction, (_, values, mask) in zip(got, rows_of(model, data), strict=True):
+        assert torch.allclose(prediction[seen], last[seen], rtol=0, atol=1e-6)
+        last, seen = torch.where(mask, values, last), seen | mask
+    assert seen.all()
 
 
 # --- self-feeding ---------------------------------------------------------------------------------
@@ -781,7 +779,7 @@ def test_the_adjoint_method_gives_the_gradients_of_backpropagation(
     data = Dataset((sample()[0].slice(0, 6), trajectory(3, 4)))
     found = []
     for gradient in ("backprop", "adjoint"):
-        model = small_model(name, gradient=gradient, **options)
+        model = with_growing_decays(small_model(name, gradient=gradient, **options))
         model(model.batch(data)).predictions.square().sum().backward()
         found.append({k: p.grad for k, p in model.named_parameters()})
     for key, expected in found[0].items():
