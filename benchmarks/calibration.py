@@ -59,6 +59,7 @@ def run(
         out: folder; the run goes to a subfolder of it.
     """
     torch.set_num_threads(threads)
+    machine = _machine(threads)  # now: a checkout may move on while this runs
     train, validation, test, scaler = protocol_data(
         observed_fraction, n_trajectories=n_trajectories, seed=seed
     )
@@ -87,7 +88,7 @@ def run(
             "seconds_of_this_call": time.perf_counter() - started,
             "row_0_constant": ob.row_0_constant(made.batch(test)),
             "scores": evaluation.to_dict(),
-            "machine": _machine(threads),
+            "machine": machine,
         },
     )
     print(json.dumps({"written": str(folder / "result.json")}))
