@@ -38,7 +38,7 @@ def predict(
 
     Raises:
         InputError: other channels than the model's, times that do not increase, or a model that
-            can't be asked for times (`readout="last_row"`, `update_rows="every"`).
+            can't be asked for times (the oddities that `thesis_config` asks for).
     """
     if times is not None:
         _check_askable(model)
@@ -65,15 +65,24 @@ def predict(
 
 
 def _check_askable(model: RecurrentModel) -> None:
+    """An asked time is a row in which nothing is observed; it must change no other prediction."""
     for field, value, meaning in (
         ("readout", "last_row", "predicts the next row, whenever it comes"),
         ("update_rows", "every", "is changed by every row, and an asked time is one more row"),
+        ("decay_rows", "every_row", "decays at every row, and an asked time is one more row"),
+        ("age_input", "gap", "looks at the gap since the row before, which an asked time cuts"),
+        ("clock", "first_row", "starts at the first row, and an asked time can come before it"),
     ):
         if getattr(model.config, field) == value:
             raise InputError(
                 f"a model with {field}={value!r} {meaning}: it can't be asked for times; leave "
                 f"times out, or train one with another {field}"
             )
+    if model.config.self_feeding:
+        raise InputError(
+            "a model with self_feeding draws a coin at every row, and an asked time is one more "
+            "row: it can't be asked for times; leave times out, or train one without self_feeding"
+        )
 
 
 def _asked(

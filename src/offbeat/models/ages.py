@@ -79,7 +79,8 @@ class Ages:
         gap: (batch, rows) growth of the saturated time since the last observed row.
         elapsed: (batch, rows) saturated time since the last observed row, on arrival at the row.
         elapsed_before: (batch, rows) the same at the row before, after its observation.
-        delta: (batch, rows, channels) saturated age of each channel (equation 25) on arrival.
+        delta: (batch, rows, channels) age of each channel (equation 25) on arrival; it stops
+            growing where `elapsed` does.
         delta_before: (batch, rows, channels) the same at the row before, after its observation.
         last: (batch, rows, channels) last value of each channel on arrival.
     """
@@ -100,7 +101,6 @@ def ages(
     carry: Carry,
     *,
     elapsed_limit: float,
-    delta_limit: float,
     from_first_row: bool = False,
 ) -> tuple[Ages, Carry]:
     """Ages at each row of a batch that continues what `carry` has seen.
@@ -109,7 +109,6 @@ def ages(
         batch: rows to come, in order.
         carry: what was seen before; its `state` and `updated` are passed on as they are.
         elapsed_limit: s, at which the time since the last observed row saturates.
-        delta_limit: s, at which the age of a channel saturates.
         from_first_row: the clock starts at the first row, observed or not.
     """
     times = batch.times
@@ -130,8 +129,10 @@ def ages(
     start = torch.minimum(carry.start, earliest)
     clock = torch.maximum(observed_at, start[:, None])
     channel_clock = torch.maximum(channel_at, start[:, None, None])
-    elapsed = (times - clock).clamp(0, elapsed_limit)
-    elapsed_before = (before - clock).clamp(0, elapsed_limit)
+    elapsed, lost = _saturate(times - clock, elapsed_limit)
+    elapsed_before, lost_before = _saturate(before - clock, elapsed_limit)
+    delta = spread - lost[..., None] - channel_clock
+    delta_before = (before - lost_before)[..., None] - channel_clock
     result = Ages(
         observed=observed,
         first=observed & (row_index < 0) & carry.observed_at.isneginf()[:, None],
@@ -139,8 +140,8 @@ def ages(
         gap=elapsed - elapsed_before,
         elapsed=elapsed,
         elapsed_before=elapsed_before,
-        delta=(spread - channel_clock).clamp(0, delta_limit),
-        delta_before=(before[..., None] - channel_clock).clamp(0, delta_limit),
+        delta=delta.clamp_min(0),
+        delta_before=delta_before.clamp_min(0),
         last=last,
     )
     carried = Carry(
@@ -155,6 +156,13 @@ def ages(
         coins=carry.coins,
     )
     return result, carried
+
+
+def _saturate(elapsed: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Time that counts, from 0 to the limit, and the time beyond the limit that does not."""
+    elapsed = elapsed.clamp_min(0)
+    counted = elapsed.clamp_max(limit)
+    return counted, elapsed - counted
 
 
 def _pick(values: Tensor, index: Tensor, otherwise: Tensor) -> Tensor:

@@ -196,7 +196,6 @@ class RecurrentModel(nn.Module):
             batch,
             carry,
             elapsed_limit=self.statistics.longest_elapsed * float(self.config.gap_limit or 1),
-            delta_limit=self.statistics.longest_delta * float(self.config.gap_limit or 1),
             from_first_row=self.config.clock == "first_row",
         )
         rows = self._rows(batch, at_rows, carry)
@@ -241,7 +240,9 @@ class RecurrentModel(nn.Module):
             shown = values
         context = [mask.to(dtype)]
         if config.age_input == "delta":
-            context.append((at_rows.delta / self.statistics.median_gap).to(dtype))
+            longest = self.statistics.longest_delta * float(config.gap_limit or 1)
+            age = at_rows.delta.clamp_max(longest)
+            context.append((age / self.statistics.median_gap).to(dtype))
         elif config.age_input in ("elapsed", "gap"):
             age = at_rows.elapsed if config.age_input == "elapsed" else at_rows.step
             context.append((age / self.statistics.median_gap).to(dtype)[..., None])
@@ -312,6 +313,11 @@ def _check(config: ModelConfig) -> None:
         raise InputError("a model needs a cell or a vector field; got neither")
     if config.cell == "none" and (config.anchored or config.input_decay or config.self_feeding):
         raise InputError("anchored, input_decay and self_feeding need a cell")
+    if config.decay_rows == "observed_rows" and config.readout == "target":
+        raise InputError(
+            "decay_rows='observed_rows' with readout='target' would tell a prediction whether its "
+            "own row is observed; use readout='last_row', or another decay_rows"
+        )
     if config.anchored and config.input_decay:
         raise InputError("an anchored state holds the channels: leave input_decay off")
 
