@@ -24,7 +24,7 @@ COMBINATIONS = [
     ("neural_ode", {"activation": "silu", "field_units": ()}),
     ("ode_rnn", {"field_units": (6, 5, 4)}),
     ("ode_gru_d", {}),
-    ("ode_gru_d", {"decay_rows": "observed_rows", "activation": "silu"}),
+    ("ode_gru_d", {"decay_rows": "observed_rows", "readout": "last_row", "activation": "silu"}),
     ("anchored_ode_gru_d", {}),
     ("anchored_ode_gru_d", {"decay": "trainable", "activation": "tanh", "field_units": (6, 5)}),
     ("anchored_ode_gru_d", {"vector_field": "none"}),

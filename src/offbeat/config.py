@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -97,7 +98,11 @@ class ModelConfig:
         for name in ("hidden_size", "steps_per_gap"):
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
         for name in ("max_step", "rtol", "atol", "typical_gap"):
-            _check(self, name, lambda v: v > 0, "a positive number")
+            _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
+        for name in ("reset_after", "input_decay", "anchored"):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, bool)):
+                raise InputError(f"{name} must be true or false, got {value!r}")
         for name in ("decoder_units", "field_units"):
             _check(
                 self,
@@ -105,7 +110,7 @@ class ModelConfig:
                 lambda v: isinstance(v, tuple) and all(isinstance(n, int) and n >= 1 for n in v),
                 "a list of layer sizes, each at least 1",
             )
-        _check(self, "gap_limit", lambda v: v >= 1, "at least 1")
+        _check(self, "gap_limit", lambda v: 1 <= v < math.inf, "at least 1, and finite")
         _check(self, "self_feeding", lambda v: 0 <= v <= 1, "a share from 0 to 1")
         if self.self_feeding and self.anchored:
             raise InputError(
@@ -192,7 +197,7 @@ class TrainConfig:
         for name in ("epochs", "batch_size", "patience", "checkpoint_every"):
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
         for name in ("learning_rate", "clip_norm", "loss_scale"):
-            _check(self, name, lambda v: v > 0, "a positive number")
+            _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
 
 
 def _check(config: Any, name: str, good: Any, expected: str) -> None:

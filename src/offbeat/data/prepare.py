@@ -65,7 +65,7 @@ def split(
         InputError: fractions are not positive or do not sum to 1, or a part would be empty.
     """
     shares = np.asarray(fractions, dtype=float)
-    if shares.ndim != 1 or (shares <= 0).any() or abs(shares.sum() - 1) > 1e-9:
+    if shares.ndim != 1 or not (shares > 0).all() or not abs(shares.sum() - 1) <= 1e-9:
         raise InputError(f"fractions must be positive and sum to 1, got {list(fractions)}")
     ends = np.round(np.cumsum(shares) * len(dataset)).astype(int)
     starts = np.concatenate([[0], ends[:-1]])

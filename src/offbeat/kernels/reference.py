@@ -186,11 +186,11 @@ def _flow_damped(
 ) -> Tensor:
     """The limit of ever shorter split steps, adaptive: h = exp(-E(s)) u, solved for u."""
     start, end, applied = decay
-    at_start = _exponent(start)
     state = _scale_hidden(spec, state, torch.exp(-_growth(start, applied)))
 
     def exponent(s: Tensor) -> Tensor:
-        return _growth(start + s * (end - start), at_start)
+        # From `start` itself: the adjoint knows the tensors it is given, not what was made of them.
+        return _growth(start + s * (end - start), _exponent(start))
 
     def damped_field(s: Tensor, u: Tensor) -> Tensor:
         grown = exponent(s)

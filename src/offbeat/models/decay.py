@@ -76,7 +76,9 @@ class InputDecay(nn.Module):
 Decay = TrainableDecay | ExponentialDecay
 
 
-def decay_rows(decay: Decay, ages: Ages, unit: float, *, rows: str, updated: Tensor) -> DecayRows:
+def decay_rows(
+    decay: Decay, ages: Ages, unit: float, *, rows: str, update: Tensor, updated: Tensor
+) -> DecayRows:
     """Exponents as the scan takes them, for one of the three meanings of a hidden row.
 
     Args:
@@ -84,14 +86,15 @@ def decay_rows(decay: Decay, ages: Ages, unit: float, *, rows: str, updated: Ten
         ages: at each row.
         unit: s per unit of model time.
         rows: `continuous`, `every_row` or `observed_rows`, as in `ModelConfig.decay_rows`.
-        updated: (batch, rows) bool, True where the cell acted at the row before.
+        update: (batch, rows) bool, True where the cell acts.
+        updated: (batch, rows) bool, True where it acted at the row before.
     """
     start, end = decay.exponents(ages, unit)
     if rows == "every_row" and isinstance(decay, TrainableDecay):
         # The whole exponent of the cumulative age again at each row: it compounds.
         start, applied = end, torch.zeros_like(end)
     elif rows == "observed_rows":
-        end = torch.where(ages.observed[..., None], end, 0.0)
+        end = torch.where(update[..., None], end, 0.0)
         start, applied = end, torch.zeros_like(end)
     else:
         applied = torch.where(updated[..., None], 0.0, start.clamp(0, LARGEST_EXPONENT))

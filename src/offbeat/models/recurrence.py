@@ -269,7 +269,12 @@ class RecurrentModel(nn.Module):
             rows = replace(rows, fed=_coins(carry, batch.rows, float(config.self_feeding)))
         if self.decay is not None:
             decay = decay_rows(
-                self.decay, at_rows, unit, rows=config.decay_rows or "", updated=updated
+                self.decay,
+                at_rows,
+                unit,
+                rows=config.decay_rows or "",
+                update=update,
+                updated=updated,
             )
             rows = replace(rows, decay=decay)
         return rows
