@@ -203,7 +203,7 @@ def test_a_channel_named_as_another_column_is_refused(name, tmp_path):
 
 def test_trajectories_of_unlike_actions_are_refused(tmp_path):
     first, second = example()
-    with pytest.raises(InputError, match="trajectory 1 has no actions, the first one has 2"):
+    with pytest.raises(InputError, match="trajectory 1 has 0 actions, the first one has 2"):
         save(Dataset([first, replace(second, actions=None)]), tmp_path / "walk.parquet")
 
 

@@ -44,11 +44,12 @@ def predict(
         _check_askable(model)
     asked = _asked(dataset, times)
     results: list[Trajectory] = []
-    coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
     for first in range(0, len(dataset), size):
         part = dataset[first : first + size]
         merged = [_merge(t, at) for t, at in zip(part, asked[first : first + size], strict=True)]
         batch = model.batch(Dataset(tuple(t for t, _ in merged)))
+        # The same coins for each part, as if they were one batch.
+        coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
         with torch.inference_mode():
             scaled = model(batch, coins=coins).predictions.double().numpy()
         for (union, rows), trajectory, values in zip(merged, part, scaled, strict=True):

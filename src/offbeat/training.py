@@ -168,10 +168,11 @@ def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 
         size: trajectories at a time.
     """
     sums = ScoreSums(batch.channels, gap_unit=model.statistics.median_gap)
-    coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
     with torch.inference_mode():
         for first in range(0, len(batch), size):
             part = batch.take(slice(first, first + size))
+            # The same coins for each part, as if they were one batch.
+            coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
             sums.add(model(part, coins=coins).predictions, part)
     return sums.scores()
 

@@ -67,7 +67,7 @@ def split(
     shares = np.asarray(fractions, dtype=float)
     if shares.ndim != 1 or not (shares > 0).all() or not abs(shares.sum() - 1) <= 1e-9:
         raise InputError(f"fractions must be positive and sum to 1, got {list(fractions)}")
-    ends = np.round(np.cumsum(shares) * len(dataset)).astype(int)
+    ends = np.floor(np.cumsum(shares) * len(dataset) + 0.5).astype(int)
     starts = np.concatenate([[0], ends[:-1]])
     if (ends <= starts).any():
         raise InputError(

@@ -55,16 +55,9 @@ class Schema:
         """The schema of a data set that is to be written.
 
         Raises:
-            InputError: a channel has the name of another column, or trajectories differ in the
-                number of their actions.
+            InputError: a channel has the name of another column.
         """
-        counts = [None if t.actions is None else t.actions.shape[1] for t in dataset]
-        if len(set(counts)) > 1:
-            other = next(i for i, count in enumerate(counts) if count != counts[0])
-            raise InputError(
-                f"trajectory {other} has {counts[other] or 'no'} actions, the first one has "
-                f"{counts[0] or 'no'}; a file holds trajectories of the same actions"
-            )
+        actions = dataset[0].actions
         differs = np.zeros(dataset.channels, dtype=bool)
         for t in dataset:
             differs |= (t.observed != t.known).any(axis=0)
@@ -75,7 +68,7 @@ class Schema:
             names=list(dataset.names),
             units=list(dataset.units),
             observed=[name for name, yes in zip(dataset.names, differs, strict=True) if yes],
-            actions=counts[0],
+            actions=None if actions is None else actions.shape[1],
             origins=[t.origin for t in dataset],
             meta=dict(dataset.meta),
         )

@@ -33,8 +33,7 @@ def save(dataset: Dataset, path: str | Path) -> None:
         path: the file to write; what stood there is replaced.
 
     Raises:
-        InputError: a channel has the name of another column, some trajectories have other actions
-            than others, or `meta` is not JSON-like.
+        InputError: a channel has the name of another column, or `meta` is not JSON-like.
         OSError: the file can't be written.
     """
     import pyarrow as pa

@@ -3,7 +3,7 @@
 Autograd records some thirty operations per row and adds up each weight's gradient row by row. Here
 the forward pass keeps what the backward pass needs in one tensor per quantity, and each weight's
 gradient is a single product over all rows at the end: the same values and gradients as the
-reference body, about three times as fast (`benchmarks/scan_bodies.py`).
+reference body, somewhat faster (`benchmarks/scan_bodies.py`).
 """
 
 from __future__ import annotations

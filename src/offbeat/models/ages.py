@@ -79,8 +79,8 @@ class Ages:
         gap: (batch, rows) growth of the saturated time since the last observed row.
         elapsed: (batch, rows) saturated time since the last observed row, on arrival at the row.
         elapsed_before: (batch, rows) the same at the row before, after its observation.
-        delta: (batch, rows, channels) age of each channel (equation 25) on arrival; it stops
-            growing where `elapsed` does.
+        delta: (batch, rows, channels) age of each channel (equation 25) on arrival; over a gap it
+            grows as long as `elapsed` does.
         delta_before: (batch, rows, channels) the same at the row before, after its observation.
         last: (batch, rows, channels) last value of each channel on arrival.
     """

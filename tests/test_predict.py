@@ -1,0 +1,62 @@
+"""Predictions in original units, at any times, whatever the size of the parts."""
+
+import numpy as np
+import pytest
+import torch
+from model_helpers import dataset, small_model
+
+import offbeat as ob
+from offbeat.models.zoo import ZOO
+
+
+@pytest.mark.parametrize("name", sorted(ZOO))
+def test_predictions_are_the_models_own_in_original_units(name):
+    data = dataset(3)
+    model = small_model(name, data, scaler="standardise")
+    scaled = model(model.batch(data)).predictions.detach().double().numpy()
+    for trajectory, got, expected in zip(data, ob.predict(model, data), scaled, strict=True):
+        assert np.array_equal(got.times, trajectory.times)
+        expected = model.scaler.original(expected[: trajectory.rows])
+        assert np.allclose(got.values, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("options", [{}, {"self_feeding": 0.5}])
+def test_predictions_do_not_depend_on_how_many_are_made_at_a_time(options):
+    data = dataset(5)
+    model = small_model("gru", data, **options)
+    one_by_one, at_once = (ob.predict(model, data, size=size) for size in (1, 5))
+    for a, b in zip(one_by_one, at_once, strict=True):
+        assert np.allclose(a.values, b.values, rtol=0, atol=1e-6)
+
+
+def test_own_times_per_trajectory_and_times_after_the_last_row():
+    data = dataset(2)
+    model = small_model("anchored_ode_gru_d", data)
+    ends = [float(t.times[-1]) for t in data]
+    asked = [[ends[0] + 0.1], [ends[1] + 0.1, ends[1] + 0.2]]
+    got = ob.predict(model, data, times=asked)
+    assert [t.times.tolist() for t in got] == asked
+    assert all(np.isfinite(t.values).all() for t in got)
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([0.2, 0.1], "increase strictly"),
+        ([], "increase strictly"),
+        ([float("nan")], "finite"),
+        ([[0.1], [0.2], [0.3]], "times for 3 trajectories, the data has 2"),
+    ],
+)
+def test_times_that_cannot_be_asked_for_are_refused(times, message):
+    data = dataset(2)
+    with pytest.raises(ob.InputError, match=message):
+        ob.predict(small_model("gru", data), data, times=times)
+
+
+def test_nothing_of_a_prediction_needs_a_gradient():
+    data = dataset(2)
+    model = small_model("ode_rnn", data)
+    ob.predict(model, data)
+    assert torch.is_grad_enabled()
+    assert all(p.grad is None for p in model.parameters())
