@@ -25,18 +25,7 @@ from offbeat.solvers import Field, solve, tableau
 def scan(
     spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Carries a batch of states over all rows.
-
-    Args:
-        spec: the shape of the scan.
-        weights: what meets the state.
-        rows: what is read at each row.
-        state: (batch, state_size) before the first row.
-
-    Returns:
-        Two tensors (rows, batch, state_size): the state carried to each row, before anything is
-        observed there, and the state after the row.
-    """
+    """Carries a batch of states over all rows; every combination, as `offbeat.kernels.scan`."""
     before: list[Tensor] = []
     after: list[Tensor] = []
     decays = _decays(spec, rows)
