@@ -21,10 +21,10 @@ DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
 A first way through, from simulation to a scored model:
 
   offbeat simulate hopper.parquet --n_trajectories 2000
-  offbeat train hopper.parquet runs/first --parts.window 100 --parts.observed_fraction 0.3 \\
+  offbeat train hopper.parquet runs/ode_rnn --parts.window 100 --parts.observed_fraction 0.3 \\
       --model.name ode_rnn --training.epochs 5
-  offbeat evaluate runs/first hopper.parquet
-  offbeat predict runs/first hopper.parquet predictions.csv
+  offbeat evaluate runs/ode_rnn hopper.parquet
+  offbeat predict runs/ode_rnn hopper.parquet predictions.csv
 
 Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 
