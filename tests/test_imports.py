@@ -22,6 +22,7 @@ STAGES = (
     "kernels",
     "models",
     "scores",
+    "run_state",
     "training",
     "inference",
     "evaluation",

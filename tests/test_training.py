@@ -202,8 +202,8 @@ def test_a_run_can_be_trained_for_longer_and_ends_as_one_that_was_planned_so(tmp
     assert same(weights(planned), weights(longer))
     with pytest.raises(ob.InputError, match="3 epochs already, 2 were asked for"):
         ob.fit(
-            longer, TRAIN, config=ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path,
-            progress=False,
+            ob.make("gru", TRAIN, **SMALL), TRAIN,
+            config=ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path, progress=False,
         )  # fmt: skip
 
 
@@ -215,7 +215,10 @@ def test_another_run_in_the_same_folder_is_refused_and_nothing_is_lost(tmp_path)
     other = ob.TrainConfig(epochs=1, batch_size=4, learning_rate=0.5)
     with pytest.raises(ob.InputError, match=r"learning_rate \(0.001 then, 0.5 now\)"):
         ob.fit(ob.make("gru", TRAIN, **SMALL), TRAIN, config=other, out=tmp_path, progress=False)
-    with pytest.raises(ob.InputError, match="training set"):
+    again = ob.make("gru", TRAIN, seed=1, **SMALL)
+    with pytest.raises(ob.InputError, match="initial_weights"):
+        ob.fit(again, TRAIN, config=config, out=tmp_path, progress=False)
+    with pytest.raises(ob.InputError, match="trajectories"):
         ob.fit(
             ob.make("gru", TRAIN, **SMALL), swinging(9), config=config, out=tmp_path, progress=False
         )

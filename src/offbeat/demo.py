@@ -29,8 +29,8 @@ from offbeat.models.zoo import THESIS_MODELS, train_config
 from offbeat.report import figures
 from offbeat.report.animation import side_by_side
 from offbeat.report.style import style_of
+from offbeat.run_state import EpochRecord
 from offbeat.scores import SCORINGS
-from offbeat.training import EpochRecord
 
 ROBOT = "hopper"
 OBSERVED_FRACTION = 0.3

@@ -2,56 +2,26 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import math
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 from offbeat.config import TrainConfig
 from offbeat.data.batch import Batch
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
-from offbeat.files import write_text
-from offbeat.models.checkpoint import load_training_state, save_checkpoint, save_training_state
+from offbeat.models.checkpoint import save_checkpoint
 from offbeat.models.recurrence import RecurrentModel
+from offbeat.run_state import EpochRecord, RunState, identity_of, resume_run, save_run, write_log
 from offbeat.scores import Scores, ScoreSums
-
-
-@dataclass(frozen=True)
-class EpochRecord:
-    """One line of the log.
-
-    Attributes:
-        epoch: counted from 1.
-        steps: optimizer steps so far.
-        train_mse: mean over the epoch's batches, scaled units, rows after the first.
-        validation_honest_mse: NaN without a validation part.
-        validation_rows_1_99_mse: the same, all rows but the first.
-        validation_published_mse: the same, the thesis' scoring.
-        learning_rate: at the end of the epoch.
-        seconds: wall time of the epoch.
-    """
-
-    epoch: int
-    steps: int
-    train_mse: float
-    validation_honest_mse: float
-    validation_rows_1_99_mse: float
-    validation_published_mse: float
-    learning_rate: float
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -72,22 +42,6 @@ class FitResult:
     def steps(self) -> int:
         """Optimizer steps in all."""
         return self.history[-1].steps if self.history else 0
-
-
-class _State:
-    """All of a training run that changes; what a checkpoint must hold."""
-
-    def __init__(self, model: RecurrentModel, config: TrainConfig) -> None:
-        self.optimizer = _optimizer(model, config)
-        self.epoch = 0  # epochs done
-        self.step = 0  # steps done within the epoch
-        self.total_steps = 0
-        self.loss_sum = 0.0
-        self.seconds = 0.0
-        self.history: list[EpochRecord] = []
-        self.best_mse = math.inf
-        self.best_epoch = 0
-        self.best: dict[str, Tensor] = {}
 
 
 def fit(
@@ -126,10 +80,10 @@ def fit(
     folder = Path(out) if out is not None else None
     batch = model.batch(train)
     held_out = model.batch(validation) if validation is not None else None
-    state = _State(model, config)
-    identity = _identity(model, config, batch)
+    state = RunState(model, config)
+    identity = identity_of(model, config, batch)
     if folder is not None:
-        _resume(folder, model, state, identity)
+        resume_run(folder, model, state, identity)
         if state.epoch > config.epochs:
             raise InputError(
                 f"{folder} holds a run of {state.epoch} epochs already, {config.epochs} were asked "
@@ -147,8 +101,8 @@ def fit(
                 writer.add_scalar(name, value, record.epoch)
             stopped = _stopped(state, config)
             if folder is not None:
-                _save(folder, model, state, identity)
-                _write_log(folder, state.history)
+                save_run(folder, model, state, identity)
+                write_log(folder, state.history)
     if writer:
         writer.close()
     if config.keep == "best" and state.best:
@@ -183,7 +137,7 @@ def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 
 def _epoch(
     model: RecurrentModel,
     batch: Batch,
-    state: _State,
+    state: RunState,
     config: TrainConfig,
     bar: Any,
     folder: Path | None,
@@ -208,12 +162,12 @@ def _epoch(
         due = config.checkpoint_every and state.step % config.checkpoint_every == 0
         if folder and due and state.step < steps:
             _check_weights(model, state)
-            _save(folder, model, state, identity)
+            save_run(folder, model, state, identity)
     state.seconds = done_before + time.perf_counter() - started
 
 
 def _step(
-    model: RecurrentModel, part: Batch, state: _State, config: TrainConfig, *, total: int
+    model: RecurrentModel, part: Batch, state: RunState, config: TrainConfig, *, total: int
 ) -> float:
     coins = None
     if model.config.self_feeding:
@@ -245,7 +199,7 @@ def _close_epoch(
     model: RecurrentModel,
     batch: Batch,
     held_out: Batch | None,
-    state: _State,
+    state: RunState,
     config: TrainConfig,
 ) -> None:
     _check_weights(model, state)
@@ -275,7 +229,7 @@ def _close_epoch(
     state.step, state.loss_sum, state.seconds = 0, 0.0, 0.0
 
 
-def _check_weights(model: RecurrentModel, state: _State) -> None:
+def _check_weights(model: RecurrentModel, state: RunState) -> None:
     if not all(bool(torch.isfinite(p).all()) for p in model.parameters()):
         raise DivergenceError(
             f"a weight left the finite numbers in epoch {state.epoch + 1}, step {state.step}; the "
@@ -283,112 +237,14 @@ def _check_weights(model: RecurrentModel, state: _State) -> None:
         )
 
 
-def _optimizer(model: RecurrentModel, config: TrainConfig) -> torch.optim.Optimizer:
-    kinds: dict[str, Any] = {
-        "adamax": torch.optim.Adamax,
-        "adam": torch.optim.Adam,
-        "adamw": torch.optim.AdamW,
-        "sgd": torch.optim.SGD,
-    }
-    optimizer: torch.optim.Optimizer = kinds[config.optimizer](
-        model.parameters(), lr=config.learning_rate, foreach=True
-    )
-    return optimizer
-
-
-def _stopped(state: _State, config: TrainConfig) -> bool:
+def _stopped(state: RunState, config: TrainConfig) -> bool:
     return config.patience is not None and state.epoch - state.best_epoch >= config.patience
 
 
-# --- the run's folder -----------------------------------------------------------------------------
+# --- what is shown ------------------------------------------------------------------------------
 
 
-def _identity(model: RecurrentModel, config: TrainConfig, batch: Batch) -> dict[str, Any]:
-    """What must be the same for a run to go on: anything else would end in other numbers."""
-    identity: dict[str, Any] = {
-        "model": asdict(model.config),
-        "train": asdict(config),
-        "trajectories": len(batch),
-        "observed_cells": int(batch.mask.sum()),
-        "checksum": float(batch.values.double().sum() + batch.times.sum()),
-    }
-    if config.schedule == "constant":
-        identity["train"].pop("epochs")  # such a run can be trained for longer
-    plain: dict[str, Any] = json.loads(json.dumps(identity))  # lists for tuples, as it is read back
-    return plain
-
-
-def _save(folder: Path, model: RecurrentModel, state: _State, identity: dict[str, Any]) -> None:
-    tensors = {f"best.{k}": v for k, v in state.best.items()}
-    for i, parameter in enumerate(model.parameters()):
-        for name, value in state.optimizer.state.get(parameter, {}).items():
-            tensors[f"optimizer.{i}.{name}"] = torch.as_tensor(value)
-    facts = {
-        "identity": identity,
-        "epoch": state.epoch,
-        "step": state.step,
-        "total_steps": state.total_steps,
-        "loss_sum": state.loss_sum,
-        "seconds": state.seconds,
-        "best_mse": state.best_mse if math.isfinite(state.best_mse) else None,
-        "best_epoch": state.best_epoch,
-        "history": [
-            {k: None if v != v else v for k, v in asdict(record).items()}
-            for record in state.history
-        ],
-        "torch_threads": torch.get_num_threads(),
-    }
-    checkpoints = folder / "checkpoints"
-    name = f"steps-{state.total_steps:09d}"
-    save_training_state(model, tensors, facts, checkpoints / name)
-    for old in sorted(checkpoints.glob("steps-*")):
-        if old.name != name:
-            shutil.rmtree(old)
-
-
-def _resume(folder: Path, model: RecurrentModel, state: _State, identity: dict[str, Any]) -> None:
-    checkpoints = sorted((folder / "checkpoints").glob("steps-*"))
-    if not checkpoints:
-        return
-    weights, tensors, facts = load_training_state(checkpoints[-1])
-    for part, now in identity.items():
-        if facts["identity"].get(part) != now:
-            raise InputError(
-                f"{folder} holds a run with another {_difference(facts['identity'].get(part), now)}"
-                f" ({part}); give the same, or another folder"
-            )
-    model.load_state_dict(weights)
-    for i, parameter in enumerate(model.parameters()):
-        prefix = f"optimizer.{i}."
-        values = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
-        if values:
-            state.optimizer.state[parameter] = values
-    state.best = {k[len("best.") :]: v for k, v in tensors.items() if k.startswith("best.")}
-    for name in ("epoch", "step", "total_steps", "loss_sum", "seconds", "best_epoch"):
-        setattr(state, name, facts[name])
-    state.best_mse = math.inf if facts["best_mse"] is None else facts["best_mse"]
-    for record in facts["history"]:
-        fields_: dict[str, Any] = {k: math.nan if v is None else v for k, v in record.items()}
-        state.history.append(EpochRecord(**fields_))
-    _write_log(folder, state.history)
-
-
-def _difference(then: Any, now: Any) -> str:
-    if isinstance(then, dict) and isinstance(now, dict):
-        keys = [k for k in now if then.get(k) != now[k]]
-        return ", ".join(f"{k} ({then.get(k)!r} then, {now[k]!r} now)" for k in keys)
-    return f"training set ({then!r} then, {now!r} now)"
-
-
-def _write_log(folder: Path, history: list[EpochRecord]) -> None:
-    text = io.StringIO()
-    log = csv.writer(text, lineterminator="\n")
-    log.writerow([f.name for f in fields(EpochRecord)])
-    log.writerows([getattr(record, f.name) for f in fields(EpochRecord)] for record in history)
-    write_text(folder / "log.csv", text.getvalue())
-
-
-def _tensorboard(folder: Path | None, state: _State) -> Any:
+def _tensorboard(folder: Path | None, state: RunState) -> Any:
     if folder is None:
         return None
     try:
@@ -400,7 +256,7 @@ def _tensorboard(folder: Path | None, state: _State) -> Any:
 
 @contextmanager
 def _progress_bar(
-    state: _State, config: TrainConfig, trajectories: int, show: bool
+    state: RunState, config: TrainConfig, trajectories: int, show: bool
 ) -> Iterator[Any]:
     steps = math.ceil(trajectories / config.batch_size)
     bar = tqdm(

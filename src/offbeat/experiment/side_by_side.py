@@ -23,7 +23,8 @@ from offbeat.data.prepare import Scaler
 from offbeat.data.store import load
 from offbeat.errors import OffbeatError
 from offbeat.models.zoo import make
-from offbeat.training import EpochRecord, fit
+from offbeat.run_state import EpochRecord
+from offbeat.training import fit
 
 
 @dataclass(frozen=True)
