@@ -102,6 +102,48 @@ def test_the_saved_config_trains_the_same_model_again(run, data, tmp_path):
     )
 
 
+def test_what_is_typed_wins_over_a_config_in_any_order(run, data, tmp_path):
+    before = (run / "results.json").read_bytes()
+    out = tmp_path / "typed"
+    assert main(["train", str(data), str(out), "--config", str(run / "config.yaml")]) == 0
+    assert (out / "results.json").is_file()
+    assert (run / "results.json").read_bytes() == before
+
+
+def test_a_part_can_be_asked_for_on_the_data_of_the_run_alone(run, data, tmp_path, capsys):
+    other = tmp_path / "other.parquet"
+    ob.save(ob.simulate("hopper", 3, 30, seed=9, progress=False), other)
+    assert "no train part" in one_line_error(capsys, "evaluate", run, other, "--part=train")
+    assert main(["evaluate", str(run), str(other)]) == 0
+    assert "part: all" in capsys.readouterr().out
+    assert main(["evaluate", str(run / "model"), str(data)]) == 0
+    assert "part: all" in capsys.readouterr().out
+
+
+def test_a_checkpoint_of_a_training_that_goes_on_can_be_used(run, data, tmp_path):
+    (checkpoint,) = (run / "checkpoints").iterdir()
+    out = tmp_path / "predictions.csv"
+    assert main(["predict", str(checkpoint), str(data), str(out), "--times", "0.1"]) == 0
+    assert out.is_file()
+
+
+def test_what_stands_there_is_not_overwritten(run, data, tmp_path, capsys):
+    copy = tmp_path / "copy.parquet"
+    copy.write_bytes(data.read_bytes())
+    assert "the data set itself" in one_line_error(capsys, "predict", run, copy, copy)
+    assert copy.read_bytes() == data.read_bytes()
+    folder = tmp_path / "other"
+    folder.mkdir()
+    (folder / "config.yaml").write_text("mine")
+    assert "holds no run" in one_line_error(capsys, "train", data, folder, *SMALL)
+    assert (folder / "config.yaml").read_text() == "mine"
+    for arguments in (["simulate", folder / "config.yaml" / "a.parquet"], ["train", data, copy]):
+        error = one_line_error(capsys, *arguments)
+        assert "can't be written" in error or "is a file" in error
+    (tmp_path / "d.parquet").mkdir()
+    assert "is a folder" in one_line_error(capsys, "simulate", tmp_path / "d.parquet")
+
+
 def test_print_config_prints_yaml_that_can_be_overridden(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["train", "a.parquet", "out", "--model.name=ode_rnn", "--print_config"])
@@ -185,6 +227,11 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(run, data, tmp_path, capsys
     assert "did you mean 'ode_rnn'" in error
     error = one_line_error(capsys, "train", data, out, "--training.epochs=none")
     assert "epochs" in error
+    for option in ("--parts.seed=-1", "--training.seed=-1", "--seed=-1"):
+        assert "seed must be" in one_line_error(capsys, "train", data, out, option)
+    assert "threads must be" in one_line_error(capsys, "train", data, out, "--threads=0")
+    error = one_line_error(capsys, "predict", run, data, out / "a.csv", "--time_unit=ms")
+    assert "option of CSV" in error
     error = one_line_error(capsys, "evaluate", tmp_path, data)
     assert "not a checkpoint" in error
     error = one_line_error(capsys, "predict", run, data, out / "a.xlsx")
@@ -208,7 +255,7 @@ def test_data_of_other_channels_and_a_damaged_checkpoint_are_refused(run, data, 
     walker = tmp_path / "walker.parquet"
     ob.save(ob.simulate("walker", 3, 30, progress=False), walker)
     error = one_line_error(capsys, "evaluate", run, walker)
-    assert "the model was made for" in error
+    assert "the model was made for other channels: the data lacks" in error
     copy = tmp_path / "copy"
     ob.save_checkpoint(ob.load_checkpoint(run), copy)
     damaged = bytearray((copy / "model.safetensors").read_bytes())

@@ -43,7 +43,7 @@ def test_own_times_per_trajectory_and_times_after_the_last_row():
     ("times", "message"),
     [
         ([0.2, 0.1], "increase strictly"),
-        ([], "increase strictly"),
+        ([], "no time is asked of trajectory 0"),
         ([float("nan")], "finite"),
         ([[0.1], [0.2], [0.3]], "times for 3 trajectories, the data has 2"),
     ],

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from offbeat.config import ModelConfig, PartsConfig, TrainConfig
+from offbeat.config import ModelConfig, PartsConfig, TrainConfig, check_seed
 from offbeat.errors import InputError, OffbeatError, one_of
 
 DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
@@ -51,9 +51,11 @@ def simulate_command(
     """
     from offbeat.data.simulate import simulate
     from offbeat.data.store import save
+    from offbeat.files import writable
 
     if out.suffix != ".parquet":
         raise InputError(f"out must be a .parquet file, got {out}")
+    writable(out)
     dataset = simulate(robot, n_trajectories, rows, seed=seed, threads=threads)
     save(dataset, out)
     _say({"written": str(out), "meta": dict(dataset.meta)}, f"{out}: {dataset!r}", json)
@@ -91,11 +93,15 @@ def train_command(
     from offbeat.data.prepare import parts as cut
     from offbeat.data.readers import read
     from offbeat.evaluation import evaluate
-    from offbeat.files import write_json, write_text
+    from offbeat.files import writable, write_json, write_text
     from offbeat.models.zoo import make
     from offbeat.training import fit
 
     one_of("scaler", scaler, SCALERS)
+    check_seed(seed)
+    if threads < 1:
+        raise InputError(f"threads must be an integer of at least 1, got {threads}")
+    writable(out, folder=True)
     torch.set_num_threads(threads)
     dataset = read(data)
     train_part, validation, test = cut(dataset, parts)
@@ -123,7 +129,7 @@ def train_command(
 def evaluate_command(
     model: Path,
     data: Path,
-    part: str = "test",
+    part: str | None = None,
     observed_fraction: float | None = None,
     out: Path | None = None,
     seed: int = 0,
@@ -135,7 +141,8 @@ def evaluate_command(
         model: folder of a run or of a checkpoint.
         data: data set (.parquet) or CSV.
         part: test, validation, train or all. On the data that the run was trained on, the same
-            windows, hidden rows and split are made again; other data can only be scored as a whole.
+            windows, hidden rows and split are made again, and test is the default; other data can
+            only be scored as a whole.
         observed_fraction: hide rows of other data at random, this share stays observed.
         out: JSON file for the scores.
         seed: of hidden rows and coins.
@@ -148,11 +155,19 @@ def evaluate_command(
     from offbeat.files import write_json
     from offbeat.models.checkpoint import load_checkpoint
 
-    one_of("part", part, ("train", "validation", "test", "all"))
+    if part is not None:
+        one_of("part", part, ("train", "validation", "test", "all"))
+    check_seed(seed)
     loaded = load_checkpoint(model)
     dataset = read(data)
     own = load_parts(model / "parts.json", dataset)
+    if own is None and part not in (None, "all"):
+        raise InputError(
+            f"there is no {part} part: {model} was not trained on {data}, or is not the folder of "
+            "a run; leave part out to score everything"
+        )
     if own is not None and part != "all":
+        part = part or "test"
         if observed_fraction is not None:
             raise InputError(
                 "the rows hidden in training are hidden again; leave observed_fraction out, or "
@@ -177,7 +192,7 @@ def predict_command(
     model: Path,
     data: Path,
     out: Path,
-    times: list[float] | None = None,
+    times: list[float] | float | None = None,
     time_unit: str | None = None,
     seed: int = 0,
     json: bool = False,
@@ -192,7 +207,9 @@ def predict_command(
         data: data set (.parquet) or CSV with a column `time`; empty cells are not known.
         out: .csv or .parquet file with columns trajectory, time (s) and one per channel.
         times: s, on the clock of the data, or since its first row where that clock is made of
-            integers; later than the last row is fine. By default the times of the rows.
+            integers: --times 0.25 or --times '[0.25, 0.5]'. Later than the last row is fine;
+            before the first observation the answer is the model's start value. By default the
+            times of the rows.
         time_unit: of the times in a CSV: s, ms, us or ns; by default what its header says.
         seed: of the coins of self-feeding.
         json: print what was written as JSON.
@@ -206,6 +223,13 @@ def predict_command(
     from offbeat.models.checkpoint import load_checkpoint
 
     one_of("suffix of out", out.suffix, (".csv", ".parquet"))
+    check_seed(seed)
+    if out.exists() and data.exists() and out.samefile(data):
+        raise InputError(f"{out} is the data set itself; give another file for the predictions")
+    if time_unit is not None and data.suffix.lower() != ".csv":
+        raise InputError(f"time_unit is an option of CSV files; {data} knows its own")
+    if isinstance(times, float):
+        times = [times]
     loaded = load_checkpoint(model)
     dataset = read(data) if time_unit is None else read(data, time_unit=time_unit)
     predicted = predict(loaded, dataset, times=times, seed=seed)
@@ -280,6 +304,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"offbeat {__version__}")
         return 0
+    arguments = _configs_first(arguments)
     try:
         auto_cli(
             COMMANDS,
@@ -296,6 +321,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted; the same command goes on from the last checkpoint", 130)
     return 0
+
+
+def _configs_first(arguments: list[str]) -> list[str]:
+    """Puts `--config FILE` before all else: what is typed wins over the file, in any order."""
+    command, rest = arguments[:1], arguments[1:]
+    configs: list[str] = []
+    while any(a == "--config" or a.startswith("--config=") for a in rest):
+        at = next(i for i, a in enumerate(rest) if a == "--config" or a.startswith("--config="))
+        width = 2 if rest[at] == "--config" else 1
+        configs += rest[at : at + width]
+        rest = rest[:at] + rest[at + width :]
+    return [*command, *configs, *rest]
 
 
 def _fail(message: str, code: int) -> int:

@@ -154,6 +154,7 @@ class PartsConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "fractions", tuple(self.fractions))
         _check(self, "window", lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        check_seed(self.seed)
 
 
 @dataclass(frozen=True)
@@ -194,10 +195,22 @@ class TrainConfig:
         one_of("optimizer", self.optimizer, ("adamax", "adam", "adamw", "sgd"))
         one_of("schedule", self.schedule, ("constant", "cosine"))
         one_of("value of keep", self.keep, ("last", "best"))
+        check_seed(self.seed)
         for name in ("epochs", "batch_size", "patience", "checkpoint_every"):
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
         for name in ("learning_rate", "clip_norm", "loss_scale"):
             _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
+
+
+def check_seed(seed: int) -> int:
+    """Returns a seed that every generator takes.
+
+    Raises:
+        InputError: it is not an integer from 0 to 2**32 - 1.
+    """
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**32:
+        raise InputError(f"seed must be an integer from 0 to {2**32 - 1}, got {seed!r}")
+    return seed
 
 
 def _check(config: Any, name: str, good: Any, expected: str) -> None:

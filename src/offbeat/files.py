@@ -11,6 +11,26 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from offbeat.errors import InputError
+
+
+def writable(path: str | Path, *, folder: bool = False) -> Path:
+    """Returns `path` if a file (or folder) can be written there; makes nothing yet.
+
+    Raises:
+        InputError: something on the way is no folder or may not be written to, or a folder stands
+            where a file is to be, or the other way round.
+    """
+    path = Path(path)
+    if path.exists() and path.is_dir() != folder:
+        stands, wanted = ("file", "folder") if folder else ("folder", "file")
+        raise InputError(f"{path} is a {stands}; give the name of a {wanted}")
+    nearest = next(parent for parent in path.absolute().parents if parent.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        why = "may not be written to" if nearest.is_dir() else "is a file"
+        raise InputError(f"{path} can't be written: {nearest} {why}; choose another place")
+    return path
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -18,7 +38,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     A block that raises, or a process that is killed, leaves what stood at `path` untouched.
     """
-    path = Path(path)
+    path = writable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
     os.close(handle)
@@ -41,7 +61,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
     A folder that stood at `path` is replaced, and only after the new one is complete.
     """
-    path = Path(path)
+    path = writable(path, folder=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:

@@ -102,9 +102,12 @@ def _asked(
             "for all, or one per trajectory"
         )
     for i, at in enumerate(each):
-        if at.ndim != 1 or not len(at) or not np.isfinite(at).all() or (np.diff(at) <= 0).any():
+        if at.ndim == 1 and not len(at):
+            raise InputError(f"no time is asked of trajectory {i}; give at least one")
+        if at.ndim != 1 or not np.isfinite(at).all() or (np.diff(at) <= 0).any():
             raise InputError(
-                f"times asked of trajectory {i} must be finite and increase strictly, got {at!r}"
+                f"times asked of trajectory {i} must be finite and increase strictly, got "
+                f"{np.array2string(at, threshold=6, separator=', ')}"
             )
     return each
 

@@ -157,11 +157,18 @@ def resume_run(
         identity: from `identity_of`.
 
     Raises:
-        InputError: the checkpoint is of a run that differs in what matters.
+        InputError: the checkpoint is of a run that differs in what matters, or the folder holds
+            something else.
         FileFormatError: the checkpoint is damaged.
     """
     checkpoints = sorted((folder / "checkpoints").glob("steps-*"))
     if not checkpoints:
+        others = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if others - {"tensorboard", "checkpoints"}:
+            raise InputError(
+                f"{folder} is not empty and holds no run ({', '.join(sorted(others)[:3])}, ...); "
+                "give a new folder"
+            )
         return
     weights, tensors, facts = load_training_state(checkpoints[-1])
     for part, now in identity.items():

@@ -182,6 +182,12 @@ def row_0_constant(batch: Batch) -> float:
     return float((batch.values[:, 0].double()[hidden] ** 2).mean())
 
 
+def _shown(rmse: float) -> str:
+    if rmse != rmse:
+        return "-"
+    return f"{rmse:.4f}" if rmse < 1e4 else f"{rmse:.2e}"
+
+
 def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None) -> str:
     """A plain-text table of scores, one line per predictor, best honest score first.
 
@@ -193,7 +199,7 @@ def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None)
     lines: list[tuple[str, ...]] = [titles]
     ranked = sorted(rows.items(), key=lambda item: item[1].honest.mse)
     for name, scores in ranked:
-        numbers = (f"{getattr(scores, s).rmse:.4f}" for s in SCORINGS)
+        numbers = (_shown(getattr(scores, s).rmse) for s in SCORINGS)
         lines.append((name, *numbers))
     widths = [max(len(line[i]) for line in lines) for i in range(len(titles))]
     text = []

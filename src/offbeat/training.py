@@ -18,6 +18,7 @@ from offbeat.config import TrainConfig
 from offbeat.data.batch import Batch
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
+from offbeat.files import writable
 from offbeat.models.checkpoint import save_checkpoint
 from offbeat.models.recurrence import RecurrentModel
 from offbeat.run_state import EpochRecord, RunState, identity_of, resume_run, save_run, write_log
@@ -77,7 +78,7 @@ def fit(
     config = config or TrainConfig()
     if validation is None and (config.patience is not None or config.keep == "best"):
         raise InputError("patience and keep='best' need a validation part; got none")
-    folder = Path(out) if out is not None else None
+    folder = writable(out, folder=True) if out is not None else None
     batch = model.batch(train)
     held_out = model.batch(validation) if validation is not None else None
     state = RunState(model, config)
@@ -262,7 +263,7 @@ def _progress_bar(
     bar = tqdm(
         total=steps * config.epochs,
         initial=state.total_steps,
-        disable=not show,
+        disable=None if show else True,  # None: where standard error is no terminal
         unit="step",
         dynamic_ncols=True,
         mininterval=0.5,

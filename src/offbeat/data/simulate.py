@@ -116,7 +116,9 @@ def _roll_out(
     with (
         _collected_warnings(mujoco) as warnings,
         rollout.Rollout(nthread=threads if threads > 1 else 0) as pool,
-        tqdm(total=len(states), desc=robot, unit=" trajectories", disable=not progress) as bar,
+        tqdm(
+            total=len(states), desc=robot, unit=" trajectories", disable=None if progress else True
+        ) as bar,
     ):
         for start in range(0, len(states), chunk):
             part = slice(start, min(start + chunk, len(states)))

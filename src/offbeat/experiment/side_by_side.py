@@ -91,7 +91,9 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
     waiting, running = list(jobs), dict[Any, tuple[Job, Any, Any]]()
     context = multiprocessing.get_context("spawn")  # a fork after torch has computed can hang
     total = sum(job.training.epochs for job in jobs)
-    with tqdm(total=total, desc="training", unit="epoch", disable=not progress) as bar:
+    with tqdm(
+        total=total, desc="training", unit="epoch", disable=None if progress else True
+    ) as bar:
         try:
             while waiting or running:
                 while waiting and len(running) < workers:

@@ -40,7 +40,8 @@ def load_checkpoint(path: str | Path) -> RecurrentModel:
     """Reads a model back: the same predictions, bit for bit.
 
     Args:
-        path: the folder of a checkpoint, or of a run that `fit` wrote.
+        path: the folder of a checkpoint, one of a training that goes on included, or of a run
+            that `fit` wrote.
 
     Raises:
         FileFormatError: the folder is missing, damaged by as little as one byte, not a checkpoint,
@@ -54,7 +55,8 @@ def load_checkpoint(path: str | Path) -> RecurrentModel:
         model = _build(facts)
         if facts["dtype"] == "float64":
             model.double()
-        model.load_state_dict(tensors)
+        weights = {k: v for k, v in tensors.items() if not k.startswith("training.")}
+        model.load_state_dict(weights)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise FileFormatError(f"{path}: its config and its weights disagree ({error})") from None
     return model

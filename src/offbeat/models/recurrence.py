@@ -151,10 +151,7 @@ class RecurrentModel(nn.Module):
             unit in ("", own[name]) or not own[name] for name, unit in given.items()
         )
         if not agree:
-            raise InputError(
-                f"the data has channels {_pairs(given)}; the model was made for {_pairs(own)}; "
-                "give it the channels it was made for"
-            )
+            raise InputError(f"the model was made for other channels: {_difference(own, given)}")
         if dataset.names != self.names:
             dataset = dataset.select(self.names)
         return Batch.of(dataset, scaler=self.scaler, dtype=self.dtype)
@@ -327,5 +324,16 @@ def _check(config: ModelConfig) -> None:
         raise InputError("an anchored state holds the channels: leave input_decay off")
 
 
-def _pairs(channels: dict[str, str]) -> str:
-    return ", ".join(f"{name} [{unit}]" for name, unit in channels.items())
+def _difference(own: dict[str, str], given: dict[str, str]) -> str:
+    """What to change in the data for it to have the channels of the model."""
+    units = (
+        f"{name} is in {given[name]}, not {unit}"
+        for name, unit in own.items()
+        if given.get(name, "") not in ("", unit)
+    )
+    named = {
+        "the data lacks": own.keys() - given.keys(),
+        "the model does not know": given.keys() - own.keys(),
+    }
+    parts = [f"{what} {', '.join(sorted(names))}" for what, names in named.items() if names]
+    return "; ".join([*parts, *units]) + "; give it the channels it was made for"

@@ -90,6 +90,11 @@ def read_csv(
     unit_said = time.casefold().removeprefix("time_")
     unit = time_unit or (unit_said if unit_said in SECONDS_PER else "s")
     one_of("time unit", unit, SECONDS_PER)
+    if unit_said in SECONDS_PER and unit != unit_said:
+        raise InputError(
+            f"{file.path}: the column {time!r} says that times are in {unit_said}, time_unit says "
+            f"{unit}; leave time_unit out, or rename the column"
+        )
 
     clock, labels, values = file.columns(header, time, label, names)
     groups = _groups(labels, file, label)
