@@ -6,26 +6,26 @@ from offbeat.errors import InputError, one_of, require
 from offbeat.files import atomic_folder, atomic_path, writable, write_json
 
 
-class Stop(Exception):
+class StopError(Exception):
     """Stands for anything that ends a writer early."""
 
 
 def stop_while_writing(path):
     with atomic_path(path) as temporary:
         temporary.write_text("half")
-        raise Stop
+        raise StopError
 
 
 def stop_while_filling(path):
     with atomic_folder(path) as temporary:
         (temporary / "a").write_text("half")
-        raise Stop
+        raise StopError
 
 
 def test_a_file_that_is_not_finished_leaves_the_old_one_and_no_trace(tmp_path):
     path = tmp_path / "new" / "a.json"
     write_json(path, {"a": 0.1})
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         stop_while_writing(path)
     assert path.read_text() == '{\n  "a": 0.1\n}\n'
     assert [p.name for p in path.parent.iterdir()] == ["a.json"]
@@ -37,7 +37,7 @@ def test_a_folder_that_is_not_finished_leaves_the_old_one_and_no_trace(tmp_path)
         with atomic_folder(path) as temporary:
             (temporary / "a").write_text(text)
         assert (path / "a").read_text() == text
-    with pytest.raises(Stop):
+    with pytest.raises(StopError):
         stop_while_filling(path)
     assert (path / "a").read_text() == "second"
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
