@@ -1,6 +1,6 @@
 """Robots and their simulation: the draw, determinism, parity, and clear errors."""
 
-from __future__ import annotations
+from __future__ import io
 
 import importlib.util
 import os
@@ -193,11 +193,17 @@ def test_the_data_set_says_how_it_was_made():
     assert set(meta["versions"]) == {"offbeat", "mujoco", "dm_control", "numpy"}
 
 
-def test_the_progress_bar_counts_trajectories_on_standard_error(capfd):
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("stream", "shown"), [(Terminal(), True), (io.StringIO(), False)])
+def test_the_progress_bar_counts_trajectories_on_a_terminal(stream, shown, monkeypatch, capfd):
+    monkeypatch.setattr(sys, "stderr", stream)
     simulate(n_trajectories=3, rows=2)
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert "3/3" in err
+    assert capfd.readouterr().out == ""
+    assert ("3/3" in stream.getvalue()) == shown
 
 
 @pytest.mark.parametrize(
