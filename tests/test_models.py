@@ -955,7 +955,7 @@ def test_channels_that_are_not_the_models_are_refused() -> None:
     for fields, message in (
         (
             {"names": ("a", "channel_1", "channel_2")},
-            "data lacks channel_0; the model does not know a",
+            "lacks channel_0; the model does not know a",
         ),
         ({"units": ("cm", "m", "m")}, "channel_0 is in cm, not m"),
     ):

@@ -1,8 +1,9 @@
 """Robots and their simulation: the draw, determinism, parity, and clear errors."""
 
-from __future__ import io
+from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import subprocess
 import sys
