@@ -30,6 +30,7 @@ STAGES = (
     "report",
     "demo",
     "doctor",
+    "commands",
     "cli",
     "__main__",
     "__init__",

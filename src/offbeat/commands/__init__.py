@@ -1,0 +1,1 @@
+"""The subcommands: one file each, a function whose arguments are the options."""

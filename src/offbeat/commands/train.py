@@ -1,0 +1,75 @@
+"""`offbeat train`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+from offbeat.commands.common import plain, say
+from offbeat.config import ModelConfig, PartsConfig, TrainConfig, check_seed
+from offbeat.errors import InputError, one_of
+
+
+def train_command(
+    data: Path,
+    out: Path,
+    model: ModelConfig = ModelConfig(),  # noqa: B008  # frozen
+    training: TrainConfig = TrainConfig(),  # noqa: B008
+    parts: PartsConfig = PartsConfig(),  # noqa: B008
+    scaler: str = "standardise",
+    seed: int = 0,
+    threads: int = 1,
+    json: bool = False,
+) -> None:
+    """Train a model on a data set, and score it on the part that was held out.
+
+    Args:
+        data: data set (.parquet) or CSV.
+        out: folder of the run: config.yaml, log.csv, checkpoints, model, results.json. A run that
+            was stopped goes on where it was.
+        model: what the model consists of; only the name is needed.
+        training: epochs, optimizer and the rest.
+        parts: windows, hidden rows, and the split into training, validation and test.
+        scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
+        seed: of the initial weights.
+        threads: of torch; one is fastest for models of this size.
+        json: print the scores as JSON.
+    """
+    import torch
+    import yaml
+
+    from offbeat.data.prepare import SCALERS, save_parts
+    from offbeat.data.prepare import parts as cut
+    from offbeat.data.readers import read
+    from offbeat.evaluation import evaluate
+    from offbeat.files import writable, write_json, write_text
+    from offbeat.models.zoo import make
+    from offbeat.training import fit
+
+    one_of("scaler", scaler, SCALERS)
+    check_seed(seed)
+    if threads < 1:
+        raise InputError(f"threads must be an integer of at least 1, got {threads}")
+    writable(out, folder=True)
+    torch.set_num_threads(threads)
+    dataset = read(data)
+    train_part, validation, test = cut(dataset, parts)
+    made = make(model, train_part, scaler=scaler, seed=seed)  # type: ignore[arg-type]
+    resolved = {
+        "data": str(data),
+        "out": str(out),
+        "model": plain(asdict(made.config)),
+        "training": plain(asdict(training)),
+        "parts": plain(asdict(parts)),
+        "scaler": scaler,
+        "seed": seed,
+        "threads": threads,
+    }
+    fitted = fit(made, train_part, validation, training, out=out)
+    write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
+    save_parts(out / "parts.json", parts, dataset)
+    evaluation = evaluate(made, test)
+    result = {"steps": fitted.steps, "part": "test", **evaluation.to_dict()}
+    write_json(out / "results.json", result)
+    heading = f"{out}: {fitted.steps} steps; RMSE on the test part, in scaled units ({scaler})"
+    say(result, f"{heading}\n{evaluation.table()}", json)
