@@ -22,7 +22,8 @@ DECLARED = [
 
 def test_the_version_stands_in_one_place_and_the_papers_repeat_it():
     assert PROJECT["project"]["dynamic"] == ["version"]
-    assert PROJECT["tool"]["hatch"]["version"]["path"] == "src/offbeat/__init__.py"
+    version = PROJECT["tool"]["scikit-build"]["metadata"]["version"]
+    assert version["input"] == "src/offbeat/__init__.py"
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == offbeat.__version__
     assert citation["license"] == PROJECT["project"]["license"]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from offbeat.data.thin import thin
     from offbeat.data.trajectory import Dataset, Trajectory
     from offbeat.evaluation import Evaluation, evaluate
-    from offbeat.inference import predict
+    from offbeat.inference.predict import predict
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
@@ -51,7 +51,7 @@ _HOMES = {
     "load_checkpoint": "models.checkpoint",
     "make": "models.zoo",
     "parts": "data.prepare",
-    "predict": "inference",
+    "predict": "inference.predict",
     "read": "data.readers",
     "row_0_constant": "scores",
     "save": "data.store",

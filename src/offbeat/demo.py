@@ -22,7 +22,7 @@ from offbeat.errors import InputError, MissingExtraError
 from offbeat.evaluation import LAST_VALUE, Evaluation, evaluate
 from offbeat.experiment.side_by_side import Job, one_thread, train_side_by_side
 from offbeat.files import write_json, write_text
-from offbeat.inference import predict
+from offbeat.inference.predict import predict
 from offbeat.models.checkpoint import load_checkpoint
 from offbeat.models.recurrence import RecurrentModel
 from offbeat.models.zoo import THESIS_MODELS, train_config

@@ -41,7 +41,7 @@ def predict_command(
     from offbeat.data.readers import read
     from offbeat.data.trajectory import SECONDS_PER
     from offbeat.data.writers import write_table
-    from offbeat.inference import predict
+    from offbeat.inference.predict import predict
     from offbeat.models.checkpoint import load_checkpoint
 
     one_of("suffix of out", out.suffix, (".csv", ".parquet"))

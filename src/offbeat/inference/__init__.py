@@ -1,0 +1,1 @@
+"""Inference: predictions, filled gaps, forecasts, and the same live."""
