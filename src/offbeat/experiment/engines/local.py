@@ -5,10 +5,13 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from offbeat.data.simulate import available_cores
 from offbeat.experiment.engines.base import Ending, Engine, attempt
@@ -49,10 +52,8 @@ class LocalEngine(Engine):
             worker = _Worker(process, ours)
             self._workers.append(worker)
         worker.task = task
-        try:
+        with suppress(OSError):  # it has died while idle; `wait` finds the task lost
             worker.pipe.send(task)
-        except OSError:
-            pass  # it has died while idle; `wait` finds the task lost
 
     def wait(self, seconds: float) -> list[Ending]:
         """Waits until a process is done with its task or has died."""
@@ -79,12 +80,13 @@ class LocalEngine(Engine):
         return endings
 
     def stop(self) -> None:
-        """Ends all processes."""
+        """Ends all processes: idle ones by closing their pipe, others by force."""
         for worker in self._workers:
-            worker.process.kill()
+            worker.pipe.close()
+            if worker.task is not None:
+                worker.process.kill()
         for worker in self._workers:
             worker.process.join()
-            worker.pipe.close()
         self._workers.clear()
 
     def pids(self) -> list[int]:
@@ -102,6 +104,7 @@ class _Worker:
 def _serve(pipe: Any) -> None:
     """A process that does one task after another, and ends with the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
+    tqdm.set_lock(threading.RLock())  # by default a semaphore, which a killed process leaves behind
     threading.Thread(target=end_with_parent, daemon=True).start()
     while True:
         try:
