@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ def reproduce_command(
     threads: int = 1,
     budget_minutes: float | None = None,
     engine_options: dict[str, Any] | None = None,
+    publish: Path | None = None,
     json: bool = False,
 ) -> None:
     """Repeat the thesis: 176 runs as it made them, and 120 that show what its numbers mean.
@@ -41,13 +43,21 @@ def reproduce_command(
         budget_minutes: stop after so long; the same command goes on later.
         engine_options: as JSON; for ray, arguments of ray.init, for slurm of submitit's
             update_parameters.
+        publish: folder to copy the record to when this call ends, for a commit: record, curves,
+            about.json (machine, versions, wall time of each sitting) and the eight models of
+            ODE-RNN and ODE-GRU-D in experiment 1.
         json: print what was done as JSON.
     """
     from offbeat.experiment.protocol import Protocol
+    from offbeat.experiment.publish import publish as publish_record
     from offbeat.experiment.reproduce import reproduce
+    from offbeat.files import writable
 
+    protocol = Protocol.tiny() if tiny else Protocol()
+    if publish is not None:
+        writable(publish, folder=True)
     done = reproduce(
-        Protocol.tiny() if tiny else Protocol(),
+        protocol,
         out,
         engine=engine,
         only=only,
@@ -58,6 +68,8 @@ def reproduce_command(
         budget_minutes=budget_minutes,
         engine_options=engine_options,
     )
+    if publish is not None:
+        publish_record(out, publish, protocol, command=["offbeat", *sys.argv[1:]])
     result = {
         "folder": str(done.folder),
         "runs_asked": len(done.asked),

@@ -214,10 +214,13 @@ def _recorded(path: str, fingerprint: str, scaler: str) -> tuple[Dataset, Scaler
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Holds a file for this process; waits for another one that holds it."""
-    with path.open("w") as file:
+    """Holds a file for this process, whose id it names; waits for another one that holds it."""
+    with path.open("a") as file:
         if os.name == "posix":
             import fcntl
 
             fcntl.flock(file, fcntl.LOCK_EX)
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
         yield

@@ -15,6 +15,7 @@ from offbeat.experiment.engines.base import Engine
 from offbeat.experiment.execute import Task
 from offbeat.experiment.progress import Progress, duration, seconds_left
 from offbeat.experiment.protocol import Run
+from offbeat.experiment.provenance import cpu
 from offbeat.experiment.record import Record, Row, group_of, group_text
 from offbeat.files import write_json
 
@@ -190,6 +191,7 @@ class _Sitting:
             "began_at": datetime.now(UTC).isoformat(timespec="seconds"),
             "seconds": 0.0,
             "engine": engine,
+            "cpu": cpu(),
             "runs": [],
         }
 
