@@ -67,7 +67,7 @@ ROUNDING = np.array([
     [5.70, 5.65, 5.55], [6.30, 6.30, 6.25],
 ])  # fmt: skip
 
-# AUC of four decision trees on 14 data sets: Demsar (2006), table 6. There, higher is better. In the
+# AUC of four decision trees, 14 data sets: Demsar (2006), table 6; higher is better there. In the
 # row before the last it prints 0.975 twice, and ranks the two 2 and 3: 0.9751 is to say the same.
 CLASSIFIERS = ("C4.5", "C4.5+m", "C4.5+cf", "C4.5+m+cf")
 AUC = np.array([
@@ -261,7 +261,7 @@ def test_hedges_g_is_cohens_d_of_a_second_library_times_the_correction():
 
 
 def test_the_small_sample_correction_has_its_closed_form_and_its_published_approximation():
-    """Hedges (1981): J = Gamma(m / 2) / (sqrt(m / 2) Gamma((m - 1) / 2)), about 1 - 3 / (4 m - 1)."""
+    """Hedges (1981): J = Gamma(m / 2) / (sqrt(m / 2) Gamma((m - 1) / 2)), near 1 - 3 / (4m - 1)."""
     assert small_sample_correction(2) == pytest.approx(1 / math.sqrt(math.pi), rel=1e-12)
     assert small_sample_correction(4) == pytest.approx(math.sqrt(2 / math.pi), rel=1e-12)
     for m in (2, 9, 18, 98, 400):

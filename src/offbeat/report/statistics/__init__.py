@@ -4,6 +4,14 @@ Which test assumes what, and which ones decide, stands in `docs/statistics.md`.
 """
 
 from offbeat.report.statistics.bootstrap import bca
+from offbeat.report.statistics.curves import (
+    Convergence,
+    Enough,
+    Settling,
+    convergence,
+    enough_epochs,
+    settling,
+)
 from offbeat.report.statistics.multiple import holm
 from offbeat.report.statistics.paired import (
     PairedComparison,
@@ -14,6 +22,7 @@ from offbeat.report.statistics.paired import (
 )
 from offbeat.report.statistics.ranks import FriedmanResult, critical_difference, friedman
 from offbeat.report.statistics.samples import Estimate, Outcome
+from offbeat.report.statistics.spread import SpreadComparison, pitman_morgan, spread_comparison
 from offbeat.report.statistics.two_samples import (
     ThesisTest,
     bartlett,
@@ -25,21 +34,30 @@ from offbeat.report.statistics.two_samples import (
 )
 
 __all__ = [
+    "Convergence",
+    "Enough",
     "Estimate",
     "FriedmanResult",
     "Outcome",
     "PairedComparison",
+    "Settling",
+    "SpreadComparison",
     "ThesisTest",
     "bartlett",
     "bca",
+    "convergence",
     "critical_difference",
+    "enough_epochs",
     "friedman",
     "hedges_g",
     "holm",
     "levene",
     "paired_comparison",
     "paired_t",
+    "pitman_morgan",
+    "settling",
     "shapiro_wilk",
+    "spread_comparison",
     "thesis_test",
     "two_sample_t",
     "welch_t",
