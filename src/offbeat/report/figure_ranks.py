@@ -94,8 +94,8 @@ def _panel(
     axes.text((left + right) / 2, 0.06, what, ha="center", va="bottom", color=_GREY, fontsize=8)
     for i, group in enumerate(result.groups):
         y = line - _BAR * (i + 1)
-        ends = [x(ranks[group[0]]) - 0.04, x(ranks[group[-1]]) + 0.04]
-        axes.plot(ends, (y, y), color=_GREY, linewidth=3.2, solid_capstyle="butt", label="_group")
+        span = [x(ranks[group[0]]) - 0.04, x(ranks[group[-1]]) + 0.04]
+        axes.plot(span, (y, y), color=_GREY, linewidth=3.2, solid_capstyle="butt", label="_group")
     first = line - _BAR * len(result.groups) - _LINE
     for place, name in enumerate(names):
         at_left = place < half
