@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
+    from offbeat.report.comparison import Comparison, compare, read_runs
     from offbeat.scores import Score, Scores, row_0_constant
     from offbeat.training import FitResult, fit
 
@@ -35,6 +36,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "THESIS_MODELS": "models.zoo",
     "Batch": "data.batch",
+    "Comparison": "report.comparison",
     "Dataset": "data.trajectory",
     "Evaluation": "evaluation",
     "FitResult": "training",
@@ -43,6 +45,7 @@ _HOMES = {
     "Score": "scores",
     "Scores": "scores",
     "Trajectory": "data.trajectory",
+    "compare": "report.comparison",
     "delta": "data.batch",
     "evaluate": "evaluation",
     "fit": "training",
@@ -53,6 +56,7 @@ _HOMES = {
     "parts": "data.prepare",
     "predict": "inference.predict",
     "read": "data.readers",
+    "read_runs": "report.comparison",
     "row_0_constant": "scores",
     "save": "data.store",
     "save_checkpoint": "models.checkpoint",
@@ -67,6 +71,7 @@ _HOMES = {
 __all__ = [
     "THESIS_MODELS",
     "Batch",
+    "Comparison",
     "Dataset",
     "DivergenceError",
     "Evaluation",
@@ -83,6 +88,7 @@ __all__ = [
     "Scores",
     "TrainConfig",
     "Trajectory",
+    "compare",
     "delta",
     "evaluate",
     "fit",
@@ -93,6 +99,7 @@ __all__ = [
     "parts",
     "predict",
     "read",
+    "read_runs",
     "row_0_constant",
     "save",
     "save_checkpoint",
