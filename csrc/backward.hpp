@@ -60,10 +60,19 @@ static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, const T* const
   for (int first = 0; first < pairs; first += PAIRS_AT_ONCE) {
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
     for (int e = 0; e < n; ++e) turn(x[first + e], m.in, in, W, xt + int64_t(e) * W * in);
-    int i = 0;
-    for (; i + 3 * VW <= in; i += 3 * VW)
-      outer_strip<4, 3>(n, W, to_out + first, m.out, xt, in, i, sum);
-    for (; i < in; i += VW) outer_strip<8, 1>(n, W, to_out + first, m.out, xt, in, i, sum);
+    for (int i = 0; i < in;) {  // strips of three vectors, the rest in pairs where it can be
+      const int left = (in - i) / VW;
+      if (left == 3 || left > 4) {
+        outer_strip<4, 3>(n, W, to_out + first, m.out, xt, in, i, sum);
+        i += 3 * VW;
+      } else if (left >= 2) {
+        outer_strip<4, 2>(n, W, to_out + first, m.out, xt, in, i, sum);
+        i += 2 * VW;
+      } else {
+        outer_strip<8, 1>(n, W, to_out + first, m.out, xt, in, i, sum);
+        i += VW;
+      }
+    }
   }
   if (m.bias < 0) return;
   for (int o = 0; o < m.out; ++o) {
@@ -445,7 +454,7 @@ static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratc
     }
     for (int row = first; row < last; ++row) {
       f[row - first] = facts<P>(d, lanes + (row - first) * fact_size);
-      gather<P>(job, d, b, row, f[row - first]);
+      gather<P>(job, d, b, row, f[row - first], -job.group);
       if (!job.tape) row_forward<P>(c, f[row - first], state, own + (row - first) * row_size);
     }
     for (int row = last - 1; row >= first; --row) {

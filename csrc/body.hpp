@@ -485,8 +485,11 @@ struct Scan {
     zero(f.nothing, widest_fact(d));
     return f;
   }
+  // Rows of many trajectories lie far apart: what is needed `ahead` rows on is asked for now.
   template <class P>
-  static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, int row, Facts<P>& f) {
+  static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, int row,
+                              Facts<P>& f, int ahead) {
+    const bool more = row + ahead >= 0 && row + ahead < b.rows;
     f.fed = job.rows.fed && job.rows.fed[row];
     f.active = false;
     for (int lane = 0; lane < P::W; ++lane) {
@@ -496,6 +499,9 @@ struct Scan {
       auto one = [&](const Fact<T>& fact) {
         return alive && fact.data ? fact.data[at * fact.by_lane + row * fact.by_row] : T(0);
       };
+      if (more && lane < b.lanes)
+        __builtin_prefetch(job.rows.gap.data + at * job.rows.gap.by_lane +
+                           (row + ahead) * job.rows.gap.by_row);
       f.gap[lane] = one(job.rows.gap);
       f.update[lane] = one(job.rows.update);
       f.updated[lane] = one(job.rows.updated);
@@ -508,6 +514,13 @@ struct Scan {
         lanes[lane] = f.alive[lane] != 0 ? fact.data + int64_t(job.order[b.first + lane]) * fact.by_lane +
                                                row * fact.by_row
                                          : f.nothing;
+      if (more)
+        for (int lane = 0; lane < b.lanes; ++lane) {
+          const T* next = fact.data + int64_t(job.order[b.first + lane]) * fact.by_lane +
+                          (row + ahead) * fact.by_row;
+          for (int u = 0; u < n; u += 64 / int(sizeof(T))) __builtin_prefetch(next + u);
+          __builtin_prefetch(next + n - 1);
+        }
       lanes_to_units(lanes, n, P::W, out);
     };
     many(job.rows.values, d.C, f.values);
@@ -862,7 +875,7 @@ struct Scan {
     for (int row = 0; row < job.n_rows; ++row) {
       if (row < b.rows) {
         T* tape = job.tape ? job.tape + b.tape + row * row_size : own;
-        gather<P>(job, d, b, row, f);
+        gather<P>(job, d, b, row, f, 2);
         row_forward<P>(c, f, state, tape);
         scatter<P>(job, b, job.before, row, tape + int64_t(c.l.before) * P::W, d.S);
       } else {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
 from offbeat.files import writable
 from offbeat.kernels import RowTable
+from offbeat.kernels.fused import own_threads
 from offbeat.models.checkpoint import save_checkpoint
 from offbeat.models.recurrence import RecurrentModel
 from offbeat.run_state import (
@@ -92,7 +93,7 @@ def fit(
     folder = writable(out, folder=True) if out is not None else None
     batch = model.batch(train)
     held_out = model.batch(validation) if validation is not None else None
-    with flat_parameters(model) as parameters:
+    with flat_parameters(model) as parameters, threads_for(model):
         return _fit(model, batch, held_out, config, RunState(parameters, config), folder, progress)
 
 
@@ -215,7 +216,7 @@ def _epoch(
     while state.step < steps:
         first = state.step * config.batch_size
         index = torch.from_numpy(order[first : first + config.batch_size])
-        loss = _step(model, examples, index, state, config, total=steps * config.epochs)
+        loss = train_step(model, examples, index, state, config, total=steps * config.epochs)
         state.loss_sum += loss
         state.step += 1
         state.total_steps += 1
@@ -231,7 +232,18 @@ def _epoch(
     state.seconds = done_before + time.perf_counter() - started
 
 
-def _step(
+@contextmanager
+def threads_for(model: RecurrentModel) -> Iterator[None]:
+    """Within a `with` block, the threads go to whatever does the work of training a model.
+
+    Args:
+        model: one that the fused body runs leaves torch with one thread.
+    """
+    with own_threads() if model.runs_fused() else nullcontext():
+        yield
+
+
+def train_step(
     model: RecurrentModel,
     examples: Examples,
     index: Tensor,
@@ -240,6 +252,19 @@ def _step(
     *,
     total: int,
 ) -> float:
+    """Takes one optimizer step on some trajectories; returns the loss before it.
+
+    Args:
+        model: trained in place.
+        examples: of the training part.
+        index: (batch,) positions of the trajectories.
+        state: optimizer and counters.
+        config: learning rate, clipping and the rest.
+        total: steps of the whole training, for a schedule.
+
+    Raises:
+        DivergenceError: the loss is not finite.
+    """
     coins = None
     if model.config.self_feeding:
         seed = np.random.default_rng([config.seed, state.epoch, state.step]).integers(2**62)

@@ -8,6 +8,9 @@ on its batch mates nor on its place in the batch, and the rows of a stream give 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 from typing import Any, cast
 
@@ -38,6 +41,35 @@ _ACTIVATIONS = {"tanh": 0, "silu": 1}
 _DECAY_ROWS = {"continuous": 0, "every_row": 1, "observed_rows": 2}
 _TYPES = {torch.float32: "f32", torch.float64: "f64"}
 _MOST_LAYERS = 16
+
+
+_threads: ContextVar[int | None] = ContextVar("offbeat_threads", default=None)
+
+
+def threads() -> int:
+    """Threads of the compiled code: as many as torch has, or as `own_threads` found it to have."""
+    own = _threads.get()
+    return torch.get_num_threads() if own is None else own
+
+
+@contextmanager
+def own_threads() -> Iterator[None]:
+    """Gives torch's threads to the compiled code within a `with` block, and leaves torch one.
+
+    Torch's idle threads spin for a while before they sleep, on the very cores that the scan is
+    about to use, and what torch has to do beside the scan is too small to be worth a second thread.
+    """
+    count = torch.get_num_threads()
+    if compiled is None or count == 1:
+        yield
+        return
+    token = _threads.set(count)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+        _threads.reset(token)
 
 
 def bodies() -> list[str]:
@@ -177,10 +209,10 @@ class _Scan(Function):
             size = compiled.tape_size(own, body, facts, first)
             if size * state.element_size() <= TAPE_LIMIT:
                 tape = state.new_empty(size)
-        threads = torch.get_num_threads()
+        ctx.threads = threads()
         compiled.scan_forward(
             own, body, _array(packed), facts, first, _array(before), _array(after), _array(tape),
-            threads,
+            ctx.threads,
         )  # fmt: skip
         ctx.own, ctx.facts, ctx.body, ctx.rows = own, facts, body, rows
         # What is returned must be kept this way: as attributes it would never be freed.
@@ -205,7 +237,7 @@ class _Scan(Function):
             _array(to_after),
             _array(to_packed),
             _array(to_state),
-            torch.get_num_threads(),
+            ctx.threads,
         )
         return None, None, None, None, to_packed, to_state
 
@@ -266,8 +298,9 @@ class _Perceptron(Function):
         if keep:
             size = getattr(compiled, f"perceptron_tape_{_TYPES[x.dtype]}")(shape, body, len(x))
             tape = x.new_empty(size)
+        ctx.threads = threads()
         compiled.perceptron_forward(
-            shape, body, _array(packed), _array(x), _array(y), _array(tape), torch.get_num_threads()
+            shape, body, _array(packed), _array(x), _array(y), _array(tape), ctx.threads
         )
         ctx.shape, ctx.body = shape, body
         ctx.save_for_backward(packed, x, tape)
@@ -288,6 +321,6 @@ class _Perceptron(Function):
             _array(to_y.contiguous()),
             _array(to_packed),
             _array(to_x),
-            torch.get_num_threads(),
+            ctx.threads,
         )
         return None, None, None, None, to_packed, to_x

@@ -18,7 +18,7 @@ from offbeat.data.batch import Batch
 from offbeat.data.prepare import Scaler
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.kernels import ScanRows, ScanSpec, ScanWeights, scan
+from offbeat.kernels import ScanRows, ScanSpec, ScanWeights, body, fused, scan
 from offbeat.models.ages import Ages, Carry, ages
 from offbeat.models.decay import ExponentialDecay, InputDecay, TrainableDecay
 from offbeat.models.parts import Cell, Perceptron, initialise
@@ -146,6 +146,15 @@ class RecurrentModel(nn.Module):
         if coins is None and self.config.self_feeding:
             coins = torch.Generator().manual_seed(0)
         return Carry.empty(self.first_state(batch), self.mean, coins=coins)
+
+    def runs_fused(self) -> bool:
+        """Whether the scan of this model runs in compiled code here."""
+        if body()[0] == "reference":
+            return False
+        nothing = torch.zeros(1, 1, dtype=self.dtype)
+        cells = torch.zeros(1, 1, self.channels, dtype=self.dtype)
+        rows = ScanRows(gap=nothing, update=nothing, values=cells, mask=cells)
+        return not fused.unsupported(self.spec, self.scan_weights(), rows, self.first_state(1))
 
     def first_state(self, batch: int) -> Tensor:
         """(batch, state_size) before anything is observed.
