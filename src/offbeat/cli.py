@@ -13,8 +13,10 @@ from typing import Any
 from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
+from offbeat.commands.export import export_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.simulate import simulate_command
+from offbeat.commands.stream import stream_command
 from offbeat.commands.train import train_command
 from offbeat.errors import OffbeatError
 
@@ -38,6 +40,8 @@ COMMANDS: dict[str, Any] = {
     "train": train_command,
     "evaluate": evaluate_command,
     "predict": predict_command,
+    "stream": stream_command,
+    "export": export_command,
     "demo": demo_command,
     "doctor": doctor_command,
 }
@@ -52,8 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     from jsonargparse import ArgumentError, auto_cli
 
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
-    # A flag, although options made from bool arguments want a value.
-    arguments = ["--json=true" if argument == "--json" else argument for argument in arguments]
+    # Flags, although options made from bool arguments want a value.
+    flags = ("--json", "--stats")
+    arguments = [f"{argument}=true" if argument in flags else argument for argument in arguments]
     if arguments == ["--version"]:
         from offbeat import __version__
 

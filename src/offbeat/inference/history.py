@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +13,7 @@ from offbeat.errors import InputError
 from offbeat.inference.engine import Engine, decode, decode_all, encode, encode_all
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Row:
+class Row(NamedTuple):
     """A row that was consumed.
 
     Attributes:
@@ -65,7 +63,8 @@ class History:
         self._engine.observe(time, values, mask)
         self._free.pop()
         self.rows.append(Row(time, values, mask, slot))
-        self._trim()
+        if len(self.rows) > self._kept:
+            self._trim()
 
     def replace(self, i: int, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
         """Other values for row i, as if they had come at once. If this raises, all is as before."""

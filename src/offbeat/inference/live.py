@@ -69,6 +69,9 @@ class LiveStream:
         self._reader = RowReader(frame.names, frame.scaler, engine.dtype)
         self._history = History(engine, policies.kept_rows)
         self._counters = StreamCounters()
+        self._held: list[_Message] = []
+        self._seen: float | None = None
+        """s, time of the newest row in which anything was measured."""
         self._pause = frame.median_gap + policies.merge_within_s
         """s, that a jump of the clock is taken for."""
         longest = policies.jump_ahead_s
@@ -79,7 +82,6 @@ class LiveStream:
             )
         limit = policies.long_gap_s
         self._long_gap = frame.elapsed_limit if limit is None else limit
-        self._forget()
 
     @property
     def time_unit(self) -> str:
@@ -90,6 +92,11 @@ class LiveStream:
     def time(self) -> Time | None:
         """Of the newest row, in the unit of the stream; None before the first."""
         return self._clock.at(self._history.newest) if self._history.rows else None
+
+    def after(self, horizon_s: float) -> Time | None:
+        """The time so many seconds after the newest row; None before the first."""
+        rows = self._history.rows
+        return self._clock.at(self._history.newest + horizon_s) if rows else None
 
     @property
     def counters(self) -> StreamCounters:
@@ -120,17 +127,15 @@ class LiveStream:
                 changed nothing then.
         """
         t = self._clock.read(t)
-        row, mask, not_finite = self._reader.read(values)
-        waited = -math.inf
-        if now is not None and self.policies.stale_after_s is not None:
-            waited = self._between(self._clock.read(now), t)
+        row, mask, measured, not_finite = self._reader.read(values)
+        waited = -math.inf if now is None else self._between(self._clock.read(now), t)
         if waited > (self.policies.stale_after_s or math.inf):
             outcome = self._dropped("stale")
         else:
-            outcome = self._take(t, row, mask)
+            outcome = self._take(t, row, mask, measured)
         self._counters.messages += 1
         self._counters.not_finite += not_finite
-        self._counters.empty += not mask.any()
+        self._counters.empty += measured == 0
         return outcome
 
     def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
@@ -225,26 +230,30 @@ class LiveStream:
 
     # --- where a message belongs ------------------------------------------------------------------
 
-    def _take(self, t: Time, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
+    def _take(
+        self, t: Time, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
+    ) -> Outcome:
         """Puts a message where it belongs: beside the rows, aside, or nowhere."""
         policies = self.policies
         if not self._history.rows:
             self._clock.origin = t
-            return self._append(0.0, values, mask)
+            return self._append(0.0, values, mask, measured)
         time = self._clock.seconds(t)
         ahead = time - self._history.newest
         if ahead < -policies.jump_back_s or ahead > (policies.jump_ahead_s or math.inf):
             return self._far(t, ahead, values, mask)
-        self._release()
+        if self._held:
+            self._release()
         if abs(ahead) <= policies.merge_within_s:
             return self._join(len(self._history.rows) - 1, values, mask)
         if ahead > 0:
-            return self._append(time, values, mask)
+            return self._append(time, values, mask, measured)
         return self._late(time, values, mask)
 
-    def _append(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
+    def _append(
+        self, time: float, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
+    ) -> Outcome:
         """The next row."""
-        measured = bool(mask.any())
         gap = time - self._seen if measured and self._seen is not None else 0.0
         long = gap > self._long_gap
         if long and self.policies.long_gap == "reset":
@@ -339,7 +348,8 @@ class LiveStream:
     def _take_held(self, message: _Message) -> None:
         """Consumes what was held; what a policy calls an error is dropped: it came long ago."""
         try:
-            self._take(message.t, message.values, message.mask)
+            measured = int(np.count_nonzero(message.mask))
+            self._take(message.t, message.values, message.mask, measured)
         except InputError:
             self._dropped("late")
 
@@ -361,9 +371,7 @@ class LiveStream:
     def _forget(self) -> None:
         self._history.forget()
         self._clock.origin = None
-        self._held: list[_Message] = []
-        self._seen: float | None = None
-        """s, time of the newest row in which anything was measured."""
+        self._held, self._seen = [], None
 
     def _dropped(self, outcome: Outcome) -> Outcome:
         setattr(self._counters, outcome, getattr(self._counters, outcome) + 1)

@@ -20,6 +20,9 @@ Time = int | float
 Values = Mapping[str, float | None] | ArrayLike
 """Channel to value, or one value per channel; NaN, None and what is left out are not measured."""
 
+_EXACT = 2.0**53
+"""Floats are further apart than 1 from here on."""
+
 
 class Clock:
     """Turns times of a unit into seconds since an origin.
@@ -49,19 +52,19 @@ class Clock:
             if isinstance(t, bool | np.bool_):
                 raise InputError(f"a time must be a number in {self.unit}, got {t!r}")
             try:
-                return operator.index(t)
+                return int(operator.index(t))
             except TypeError:
                 pass
             if not isinstance(t, float | np.floating):
                 raise InputError(f"a time must be a number in {self.unit}, got {t!r}")
-            t = float(t)
-        if not math.isfinite(t):
+        number = float(t)
+        if -_EXACT < number < _EXACT:
+            return number
+        if not math.isfinite(number):
             raise InputError(f"a time must be finite, got {t!r}")
-        if abs(t) >= 2**53:
-            raise InputError(
-                f"a float does not hold {t!r} {self.unit} to the last digit; give an integer"
-            )
-        return t
+        raise InputError(
+            f"a float does not hold {t!r} {self.unit} to the last digit; give an integer"
+        )
 
     def seconds(self, t: Time) -> float:
         """Since the origin; 0 while there is none.
@@ -102,22 +105,28 @@ class RowReader:
         self.names = tuple(names)
         self._index = {name: i for i, name in enumerate(self.names)}
         self._scaler, self._dtype = scaler, dtype
-        self._largest = float(np.finfo(dtype).max)
+        # Values between these stay finite when scaled; no comparison with NaN is true.
+        largest = np.finfo(np.float64).max / 4
+        with np.errstate(over="ignore"):
+            reach = np.minimum(0.99 * float(np.finfo(dtype).max) * np.abs(scaler.scale), largest)
+        self._low, self._high = scaler.shift - reach, scaler.shift + reach
 
-    def read(self, values: Values) -> tuple[NDArray[Any], NDArray[np.bool_], int]:
-        """Scaled values (0 where not measured), their mask, and how many were not finite.
+    def read(self, values: Values) -> tuple[NDArray[Any], NDArray[np.bool_], int, int]:
+        """Scaled values (0 where not measured), their mask, and two counts.
+
+        The counts are of what was measured, and of what was not finite, or too large once scaled,
+        and counts as not measured.
 
         Raises:
             InputError: unknown channels, another number of them, or something that is no number.
         """
         raw = self._named(values) if isinstance(values, Mapping) else self._all(values)
-        with np.errstate(all="ignore"):
-            scaled = self._scaler.scaled(raw)
-            mask = np.abs(scaled) <= self._largest  # False for NaN
-        measured = int(np.count_nonzero(mask))
-        unmeasured = len(mask) - measured
-        bad = unmeasured - int(np.count_nonzero(np.isnan(raw))) if unmeasured else 0
-        return np.where(mask, scaled, 0.0).astype(self._dtype), mask, bad
+        mask = (raw >= self._low) & (raw <= self._high)
+        measured, not_finite = int(np.count_nonzero(mask)), 0
+        if measured < len(mask):
+            not_finite = len(mask) - measured - int(np.count_nonzero(np.isnan(raw)))
+            raw = np.where(mask, raw, self._scaler.shift)
+        return self._scaler.scaled(raw).astype(self._dtype), mask, measured, not_finite
 
     def _named(self, values: Mapping[str, Any]) -> NDArray[np.float64]:
         raw = np.full(len(self.names), np.nan)

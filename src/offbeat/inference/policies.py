@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal
 
 from offbeat.errors import InputError, one_of
@@ -153,6 +153,21 @@ class StreamCounters:
         if not all(_is_number(number) and number >= 0 for number in value.values()):
             raise InputError(f"a counter is a number of at least 0, got {value!r}")
         return cls(**value)
+
+
+def with_options(policies: StreamPolicies | None, options: dict[str, Any]) -> StreamPolicies:
+    """The policies with some fields replaced.
+
+    Args:
+        policies: None stands for the defaults.
+        options: fields of `StreamPolicies`.
+
+    Raises:
+        InputError: an unknown field, or a value out of its range.
+    """
+    for key in options:
+        one_of("policy of streams", key, [f.name for f in fields(StreamPolicies)])
+    return replace(policies or StreamPolicies(), **options)
 
 
 def _is_number(value: Any) -> bool:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
 from typing import Any
 
 from offbeat.config import check_seed
-from offbeat.errors import one_of
 from offbeat.inference.engine import Engine
 from offbeat.inference.live import Frame, LiveStream
-from offbeat.inference.policies import StreamPolicies
+from offbeat.inference.policies import StreamPolicies, with_options
 from offbeat.inference.torch_engine import TorchEngine
 from offbeat.models.recurrence import RecurrentModel
 
@@ -67,14 +65,3 @@ class Stream(LiveStream):
 def engine_of(model: RecurrentModel, *, seed: int) -> Engine:
     """The fastest engine that runs a model."""
     return TorchEngine(model, seed=seed)
-
-
-def with_options(policies: StreamPolicies | None, options: dict[str, Any]) -> StreamPolicies:
-    """The policies with some fields replaced.
-
-    Raises:
-        InputError: an unknown field, or a value out of its range.
-    """
-    for key in options:
-        one_of("policy", key, [f.name for f in fields(StreamPolicies)])
-    return replace(policies or StreamPolicies(), **options)
