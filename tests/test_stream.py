@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 from model_helpers import dataset, small_model, trajectory, with_observed
-from stream_helpers import NAMES, Recorded, batch_predictions, message
-from test_contract import FLOAT32, FLOAT64, TOLERANCE, VARIANTS, build, dtypes, variants
+from stream_helpers import Recorded, batch_predictions, message
+from test_contract import FLOAT32, TOLERANCE, VARIANTS, build, dtypes, variants
 
 from offbeat import (
     DivergenceError,
@@ -402,9 +402,3 @@ def test_the_memory_of_the_process_stays_as_it_is_over_twenty_thousand_steps() -
     before = resident()
     live(5000, 20_000)
     assert resident() - before < 2 * 2**20
-
-
-def test_the_names_of_recorded_streams_are_those_of_the_helpers() -> None:
-    assert Recorded().names == NAMES
-    assert len(VARIANTS) > 2 * len(ZOO)
-    assert TOLERANCE[FLOAT64] == 1e-12

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -86,19 +85,14 @@ class LineSession:
         )
 
     def _observe(self, message: dict[str, Any]) -> dict[str, Any]:
-        t, values = message["t"], message["values"]
-        before = None
+        t, values, now = message["t"], message["values"], message.get("now")
         if self.horizon_s is None:
-            with suppress(InputError):  # of a time that has passed; or `observe` will say it
-                before = self.stream.predict(t)
-        outcome = self.stream.observe(t, values, now=message.get("now"))
-        said: dict[str, Any] = {"t": t, "outcome": outcome}
-        if self.horizon_s is None:
-            said["prediction"] = self._named(before) if outcome == "new" else None
-            return said
+            outcome, predicted = self.stream.step(t, values, now=now)
+            return {"t": t, "outcome": outcome, "prediction": self._named(predicted)}
+        outcome = self.stream.observe(t, values, now=now)
         at = self.stream.after(self.horizon_s)
         after = None if at is None else self.stream.predict(at)
-        return said | {"at": at, "prediction": self._named(after)}
+        return {"t": t, "outcome": outcome, "at": at, "prediction": self._named(after)}
 
     def _command(self, key: str) -> dict[str, Any]:
         if key == "state":

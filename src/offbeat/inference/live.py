@@ -72,6 +72,8 @@ class LiveStream:
         self._held: list[_Message] = []
         self._seen: float | None = None
         """s, time of the newest row in which anything was measured."""
+        self._stepping = False
+        self._predicted: NDArray[np.float64] | None = None
         self._pause = frame.median_gap + policies.merge_within_s
         """s, that a jump of the clock is taken for."""
         longest = policies.jump_ahead_s
@@ -138,6 +140,31 @@ class LiveStream:
         self._counters.empty += measured == 0
         return outcome
 
+    def step(
+        self, t: Time, values: Values, *, now: Time | None = None
+    ) -> tuple[Outcome, NDArray[np.float64] | None]:
+        """Predicts a row, then takes it: `observe`, with the prediction that was made before it.
+
+        Args:
+            t: as in `observe`.
+            values: as in `observe`; the prediction is made before they are looked at.
+            now: as in `observe`.
+
+        Returns:
+            What became of the message; and where it is a `new` row, (channels,) predicted for it
+            in original units, one step ahead.
+
+        Raises:
+            InputError: as `observe`.
+            DivergenceError: as `observe` and `predict`.
+        """
+        self._stepping, self._predicted = True, None
+        try:
+            outcome = self.observe(t, values, now=now)
+        finally:
+            self._stepping = False
+        return outcome, self._predicted if outcome == "new" else None
+
     def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
         """Predicts the channels at a time, from all that was observed; consumes nothing.
 
@@ -161,12 +188,8 @@ class LiveStream:
         asked = [self._asked(self._clock.read(one)) for one in (t if several else [t])]  # type: ignore[union-attr]
         if not asked:
             return np.empty((0, len(self.names)))
-        scaled = self._engine.predict(np.array(asked))
-        if not np.isfinite(scaled).all():
-            raise DivergenceError("the state has left the finite numbers; reset the stream")
-        self._counters.predictions += len(asked)
-        original = self._frame.scaler.original(scaled)
-        return original if several else original[0]
+        predicted = self._predict(np.array(asked))
+        return predicted if several else predicted[0]
 
     def reset(self) -> None:
         """Begins anew: nothing seen yet. The counters go on."""
@@ -260,6 +283,8 @@ class LiveStream:
             origin, floor = self._clock.origin, self._history.newest
             self.reset()
             self._clock.origin, self._history.floor = origin, floor
+        if self._stepping:
+            self._predicted = self._predict(np.array([time]))[0]
         self._history.append(time, values, mask)
         self._counters.rows += 1
         if measured:
@@ -376,6 +401,14 @@ class LiveStream:
     def _dropped(self, outcome: Outcome) -> Outcome:
         setattr(self._counters, outcome, getattr(self._counters, outcome) + 1)
         return outcome
+
+    def _predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(times, channels) in original units."""
+        scaled = self._engine.predict(times)
+        if not np.isfinite(scaled).all():
+            raise DivergenceError("the state has left the finite numbers; reset the stream")
+        self._counters.predictions += len(times)
+        return self._frame.scaler.original(scaled)
 
     def _asked(self, t: Time) -> float:
         """A time that was asked for, in s."""
