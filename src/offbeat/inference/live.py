@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from offbeat.data.prepare import Scaler
 from offbeat.errors import DivergenceError, InputError
-from offbeat.inference.engine import Engine, decode, encode
-from offbeat.inference.history import History, seconds
-from offbeat.inference.messages import Clock, RowReader, Time, Values
+from offbeat.inference.engine import Engine
+from offbeat.inference.messages import RowReader, Time, Values
+from offbeat.inference.placing import Placement
 from offbeat.inference.policies import Outcome, StreamCounters, StreamPolicies
 
 FORMAT = "offbeat-stream"
@@ -39,15 +39,6 @@ class Frame:
     elapsed_limit: float
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Message:
-    """A message kept aside, its time as it came, its values as a row."""
-
-    t: Time
-    values: NDArray[Any]
-    mask: NDArray[np.bool_]
-
-
 class LiveStream:
     """Feeds messages to an engine, one row at a time; `Stream` and `OnnxStream` are public.
 
@@ -65,25 +56,16 @@ class LiveStream:
     ) -> None:
         self.names, self.units, self.policies = frame.names, frame.units, policies
         self._engine, self._frame = engine, frame
-        self._clock = Clock(time_unit)
         self._reader = RowReader(frame.names, frame.scaler, engine.dtype)
-        self._history = History(engine, policies.kept_rows)
-        self._counters = StreamCounters()
-        self._held: list[_Message] = []
-        self._seen: float | None = None
-        """s, time of the newest row in which anything was measured."""
-        self._stepping = False
-        self._predicted: NDArray[np.float64] | None = None
-        self._pause = frame.median_gap + policies.merge_within_s
-        """s, that a jump of the clock is taken for."""
-        longest = policies.jump_ahead_s
-        if policies.jump == "continue" and longest is not None and longest <= self._pause:
-            raise InputError(
-                f"jump_ahead_s is {longest!r}, no longer than the model's usual gap of "
-                f"{frame.median_gap:g} s (and merge_within_s): every row would be a jump"
-            )
-        limit = policies.long_gap_s
-        self._long_gap = frame.elapsed_limit if limit is None else limit
+        self._placing = Placement(
+            engine,
+            policies,
+            names=frame.names,
+            time_unit=time_unit,
+            median_gap=frame.median_gap,
+            elapsed_limit=frame.elapsed_limit,
+        )
+        self._clock, self._history = self._placing.clock, self._placing.history
 
     @property
     def time_unit(self) -> str:
@@ -93,7 +75,7 @@ class LiveStream:
     @property
     def time(self) -> Time | None:
         """Of the newest row, in the unit of the stream; None before the first."""
-        return self._clock.at(self._history.newest) if self._history.rows else None
+        return self._placing.time
 
     def after(self, horizon_s: float) -> Time | None:
         """The time so many seconds after the newest row; None before the first."""
@@ -103,12 +85,12 @@ class LiveStream:
     @property
     def counters(self) -> StreamCounters:
         """A copy of the counts so far."""
-        return replace(self._counters)
+        return replace(self._placing.counters)
 
     @property
     def held(self) -> int:
         """Messages kept aside until it is clear whether the clock has jumped."""
-        return len(self._held)
+        return len(self._placing.held)
 
     def observe(self, t: Time, values: Values, *, now: Time | None = None) -> Outcome:
         """Takes what was measured at a time.
@@ -130,14 +112,15 @@ class LiveStream:
         """
         t = self._clock.read(t)
         row, mask, measured, not_finite = self._reader.read(values)
-        waited = -math.inf if now is None else self._between(self._clock.read(now), t)
+        waited = -math.inf if now is None else self._clock.between(self._clock.read(now), t)
         if waited > (self.policies.stale_after_s or math.inf):
-            outcome = self._dropped("stale")
+            outcome = self._placing.drop("stale")
         else:
-            outcome = self._take(t, row, mask, measured)
-        self._counters.messages += 1
-        self._counters.not_finite += not_finite
-        self._counters.empty += measured == 0
+            outcome = self._placing.take(t, row, mask, measured)
+        counters = self._placing.counters
+        counters.messages += 1
+        counters.not_finite += not_finite
+        counters.empty += measured == 0
         return outcome
 
     def step(
@@ -158,12 +141,17 @@ class LiveStream:
             InputError: as `observe`.
             DivergenceError: as `observe` and `predict`.
         """
-        self._stepping, self._predicted = True, None
+        predicted: list[NDArray[np.float64]] = []
+
+        def before_row(time: float) -> None:
+            predicted.append(self._predict(np.array([time]))[0])
+
+        self._placing.before_row = before_row
         try:
             outcome = self.observe(t, values, now=now)
         finally:
-            self._stepping = False
-        return outcome, self._predicted if outcome == "new" else None
+            self._placing.before_row = None
+        return outcome, predicted[-1] if outcome == "new" else None
 
     def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
         """Predicts the channels at a time, from all that was observed; consumes nothing.
@@ -193,9 +181,7 @@ class LiveStream:
 
     def reset(self) -> None:
         """Begins anew: nothing seen yet. The counters go on."""
-        self._engine.reset()
-        self._forget()
-        self._counters.resets += 1
+        self._placing.begin_anew()
 
     def state(self) -> dict[str, Any]:
         """All that the stream is, as JSON knows it; `restore` goes on from it bit for bit."""
@@ -204,13 +190,7 @@ class LiveStream:
             "version": VERSION,
             "model": self._engine.fingerprint(),
             "time_unit": self.time_unit,
-            "origin": self._clock.origin,
-            "seen": self._seen,
-            "history": self._history.record(),
-            "held": [
-                {"t": m.t, "values": encode(m.values), "mask": encode(m.mask)} for m in self._held
-            ],
-            "counters": self._counters.to_dict(),
+            **self._placing.record(),
         }
 
     def restore(self, record: dict[str, Any]) -> None:
@@ -230,184 +210,14 @@ class LiveStream:
             if record.get(key) != expected:
                 got = record.get(key)
                 raise InputError(f"the record is of {key} {got!r}, not {expected!r}; {fix}")
-        channels = len(self.names)
-        values, mask = np.zeros(channels, self._engine.dtype), np.zeros(channels, dtype=bool)
-        try:
-            origin = None if record["origin"] is None else self._clock.read(record["origin"])
-            seen = None if record["seen"] is None else seconds(record["seen"])
-            held = [
-                _Message(
-                    self._clock.read(m["t"]),
-                    decode(m["values"], values, "values of a held message"),
-                    decode(m["mask"], mask, "mask of a held message"),
-                )
-                for m in record["held"]
-            ]
-            counters = StreamCounters.from_dict(record["counters"])
-            self._history.restore(record["history"], channels)
-        except (KeyError, TypeError) as error:
-            what = f"{type(error).__name__}: {error}"
-            raise InputError(f"the record of the stream is damaged ({what})") from None
-        self._clock.origin, self._seen = origin, seen
-        self._held, self._counters = held, counters
-
-    # --- where a message belongs ------------------------------------------------------------------
-
-    def _take(
-        self, t: Time, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
-    ) -> Outcome:
-        """Puts a message where it belongs: beside the rows, aside, or nowhere."""
-        policies = self.policies
-        if not self._history.rows:
-            self._clock.origin = t
-            return self._append(0.0, values, mask, measured)
-        time = self._clock.seconds(t)
-        ahead = time - self._history.newest
-        if ahead < -policies.jump_back_s or ahead > (policies.jump_ahead_s or math.inf):
-            return self._far(t, ahead, values, mask)
-        if self._held:
-            self._release()
-        if abs(ahead) <= policies.merge_within_s:
-            return self._join(len(self._history.rows) - 1, values, mask)
-        if ahead > 0:
-            return self._append(time, values, mask, measured)
-        return self._late(time, values, mask)
-
-    def _append(
-        self, time: float, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
-    ) -> Outcome:
-        """The next row."""
-        gap = time - self._seen if measured and self._seen is not None else 0.0
-        long = gap > self._long_gap
-        if long and self.policies.long_gap == "reset":
-            origin, floor = self._clock.origin, self._history.newest
-            self.reset()
-            self._clock.origin, self._history.floor = origin, floor
-        if self._stepping:
-            self._predicted = self._predict(np.array([time]))[0]
-        self._history.append(time, values, mask)
-        self._counters.rows += 1
-        if measured:
-            self._seen = time
-            self._counters.long_gaps += long
-            self._counters.longest_gap_s = max(self._counters.longest_gap_s, gap)
-        return "new"
-
-    def _join(self, i: int, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
-        """A message of the time of row i."""
-        old = self._history.rows[i]
-        twice = mask & old.mask
-        repeated = bool(twice.any())
-        if repeated and self.policies.duplicates == "error":
-            raise InputError(
-                f"measured twice at the time {self._clock.at(old.time)}: "
-                f"{', '.join(np.array(self.names)[twice])}; choose the policy duplicates='first' "
-                "or 'last' if that may be"
-            )
-        taken = mask if self.policies.duplicates == "last" else mask & ~old.mask
-        joined, union = np.where(taken, values, old.values), old.mask | taken
-        changed = not (np.array_equal(joined, old.values) and np.array_equal(union, old.mask))
-        if changed:
-            self._history.replace(i, joined, union)
-            self._seen = max(old.time if self._seen is None else self._seen, old.time)
-        self._counters.duplicates += repeated
-        self._counters.merged += changed
-        return "merged" if changed else "duplicate"
-
-    def _late(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
-        """A message older than the newest row."""
-        policies, behind = self.policies, self._history.newest - time
-        if behind > (policies.stale_after_s or math.inf):
-            return self._dropped("stale")
-        if policies.late == "error":
-            raise InputError(
-                f"a message is {behind:g} s older than the newest row, of the time {self.time}; "
-                "choose the policy late='drop' or 'reorder' if that may be"
-            )
-        place = self._history.place(time, policies.merge_within_s)
-        if policies.late == "drop" or place is None:
-            return self._dropped("late")
-        i, joins = place
-        if joins:
-            return self._join(i, values, mask)
-        self._history.insert(i, time, values, mask)
-        if mask.any():
-            self._seen = time if self._seen is None else max(self._seen, time)
-        self._counters.rows += 1
-        self._counters.reordered += 1
-        return "reordered"
-
-    # --- clocks that jump -------------------------------------------------------------------------
-
-    def _far(self, t: Time, ahead: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
-        """A message so far off that the clock may have jumped."""
-        policies = self.policies
-        if policies.jump == "error":
-            newer = "newer" if ahead > 0 else "older"
-            raise InputError(
-                f"a message is {abs(ahead):g} s {newer} than the newest row, of the time "
-                f"{self.time}; choose another policy of jump if that may be"
-            )
-        if policies.jump == "drop":
-            if ahead > 0:
-                return self._dropped("ahead")
-            return self._late(self._clock.seconds(t), values, mask)
-        if self._held:
-            step = self._between(t, self._held[-1].t)
-            if not -policies.jump_back_s <= step <= (policies.jump_ahead_s or math.inf):
-                self._release()
-        self._held.append(_Message(t, values, mask))
-        if len(self._held) < policies.confirm:
-            return "held"
-        held, self._held = sorted(self._held, key=lambda message: message.t), []
-        self._counters.jumps_ahead += ahead > 0
-        self._counters.jumps_back += ahead < 0
-        if policies.jump == "reset":
-            self.reset()
-        else:
-            self._clock.rebase(held[0].t, self._history.newest + self._pause)
-        for message in held:
-            self._take_held(message)
-        return "jumped"
-
-    def _take_held(self, message: _Message) -> None:
-        """Consumes what was held; what a policy calls an error is dropped: it came long ago."""
-        try:
-            measured = int(np.count_nonzero(message.mask))
-            self._take(message.t, message.values, message.mask, measured)
-        except InputError:
-            self._dropped("late")
-
-    def _release(self) -> None:
-        """The clock has not jumped: held messages are late ones, or too far ahead."""
-        held, self._held = self._held, []
-        for message in held:
-            time = self._clock.seconds(message.t)
-            if time > self._history.newest:
-                self._dropped("ahead")
-                continue
-            try:
-                self._late(time, message.values, message.mask)
-            except InputError:
-                self._dropped("late")
-
-    # --- small things -----------------------------------------------------------------------------
-
-    def _forget(self) -> None:
-        self._history.forget()
-        self._clock.origin = None
-        self._held, self._seen = [], None
-
-    def _dropped(self, outcome: Outcome) -> Outcome:
-        setattr(self._counters, outcome, getattr(self._counters, outcome) + 1)
-        return outcome
+        self._placing.restore(record)
 
     def _predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """(times, channels) in original units."""
         scaled = self._engine.predict(times)
         if not np.isfinite(scaled).all():
             raise DivergenceError("the state has left the finite numbers; reset the stream")
-        self._counters.predictions += len(times)
+        self._placing.counters.predictions += len(times)
         return self._frame.scaler.original(scaled)
 
     def _asked(self, t: Time) -> float:
@@ -421,10 +231,3 @@ class LiveStream:
                 f"{self.time}; a stream answers for the time of its newest row and later"
             )
         return max(time, newest)
-
-    def _between(self, later: Time, earlier: Time) -> float:
-        """Seconds from one time to another."""
-        try:
-            return (later - earlier) / self._clock.ticks
-        except OverflowError:
-            return math.inf if later > earlier else -math.inf

@@ -85,6 +85,13 @@ class Clock:
         ticks = seconds * self.ticks
         return origin + (round(ticks) if isinstance(origin, int) and self.ticks > 1 else ticks)
 
+    def between(self, later: Time, earlier: Time) -> float:
+        """Seconds from one time to another; infinite where no float can tell."""
+        try:
+            return (later - earlier) / self.ticks
+        except OverflowError:
+            return math.inf if later > earlier else -math.inf
+
     def rebase(self, t: Time, seconds: float) -> None:
         """Moves the origin, so that `t` lies so many seconds after it."""
         ticks = seconds * self.ticks
