@@ -23,7 +23,11 @@ if TYPE_CHECKING:
     from offbeat.data.thin import thin
     from offbeat.data.trajectory import Dataset, Trajectory
     from offbeat.evaluation import Evaluation, evaluate
+    from offbeat.inference.export import export_onnx
+    from offbeat.inference.onnx_runner import OnnxStream
+    from offbeat.inference.policies import StreamPolicies
     from offbeat.inference.predict import predict
+    from offbeat.inference.stream import Stream
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
@@ -40,14 +44,18 @@ _HOMES = {
     "Dataset": "data.trajectory",
     "Evaluation": "evaluation",
     "FitResult": "training",
+    "OnnxStream": "inference.onnx_runner",
     "RecurrentModel": "models.recurrence",
     "Scaler": "data.prepare",
     "Score": "scores",
     "Scores": "scores",
+    "Stream": "inference.stream",
+    "StreamPolicies": "inference.policies",
     "Trajectory": "data.trajectory",
     "compare": "report.comparison",
     "delta": "data.batch",
     "evaluate": "evaluation",
+    "export_onnx": "inference.export",
     "fit": "training",
     "last_values": "data.batch",
     "load": "data.store",
@@ -81,16 +89,20 @@ __all__ = [
     "MissingExtraError",
     "ModelConfig",
     "OffbeatError",
+    "OnnxStream",
     "PartsConfig",
     "RecurrentModel",
     "Scaler",
     "Score",
     "Scores",
+    "Stream",
+    "StreamPolicies",
     "TrainConfig",
     "Trajectory",
     "compare",
     "delta",
     "evaluate",
+    "export_onnx",
     "fit",
     "last_values",
     "load",

@@ -15,9 +15,11 @@ from offbeat.commands.compare import compare_command
 from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
+from offbeat.commands.export import export_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
+from offbeat.commands.stream import stream_command
 from offbeat.commands.train import train_command
 from offbeat.errors import OffbeatError
 
@@ -42,6 +44,8 @@ COMMANDS: dict[str, Any] = {
     "evaluate": evaluate_command,
     "predict": predict_command,
     "compare": compare_command,
+    "stream": stream_command,
+    "export": export_command,
     "demo": demo_command,
     "reproduce": reproduce_command,
     "doctor": doctor_command,
@@ -49,6 +53,10 @@ COMMANDS: dict[str, Any] = {
 
 # Commands that take any number of paths, as a shell hands them over.
 MANY_PATHS = ("compare",)
+
+
+FLAGS = ("--json", "--stats", "--tiny")
+"""Options that need no value."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -60,11 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     from jsonargparse import ArgumentError, auto_cli
 
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
-    # A flag, although options made from bool arguments want a value.
-    arguments = [
-        f"{argument}=true" if argument in ("--json", "--tiny") else argument
-        for argument in arguments
-    ]
+    # Flags, although options made from bool arguments want a value.
+    arguments = [f"{argument}=true" if argument in FLAGS else argument for argument in arguments]
     if arguments == ["--version"]:
         from offbeat import __version__
 
