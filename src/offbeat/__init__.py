@@ -16,12 +16,13 @@ from offbeat.errors import (
 
 if TYPE_CHECKING:
     from offbeat.data.batch import Batch, delta, last_values
-    from offbeat.data.prepare import Scaler, parts, split, windows
+    from offbeat.data.prepare import Scaler, parts, split, split_in_time
     from offbeat.data.readers import read
     from offbeat.data.simulate import simulate
     from offbeat.data.store import load, save
     from offbeat.data.thin import thin
     from offbeat.data.trajectory import Dataset, Trajectory
+    from offbeat.data.windows import windows
     from offbeat.evaluation import Evaluation, evaluate
     from offbeat.inference.predict import predict
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
@@ -58,10 +59,11 @@ _HOMES = {
     "save_checkpoint": "models.checkpoint",
     "simulate": "data.simulate",
     "split": "data.prepare",
+    "split_in_time": "data.prepare",
     "thesis_config": "models.zoo",
     "thin": "data.thin",
     "train_config": "models.zoo",
-    "windows": "data.prepare",
+    "windows": "data.windows",
 }
 
 __all__ = [
@@ -98,6 +100,7 @@ __all__ = [
     "save_checkpoint",
     "simulate",
     "split",
+    "split_in_time",
     "thesis_config",
     "thin",
     "train_config",
