@@ -24,7 +24,11 @@ if TYPE_CHECKING:
     from offbeat.data.trajectory import Dataset, Trajectory
     from offbeat.data.windows import windows
     from offbeat.evaluation import Evaluation, evaluate
+    from offbeat.inference.extrapolate import extrapolate
+    from offbeat.inference.impute import fit_two_sided, impute, load_two_sided, save_two_sided
     from offbeat.inference.predict import predict
+    from offbeat.inference.scoring import score_extrapolation, score_imputation
+    from offbeat.inference.two_sided import TwoSided
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
@@ -44,12 +48,17 @@ _HOMES = {
     "Score": "scores",
     "Scores": "scores",
     "Trajectory": "data.trajectory",
+    "TwoSided": "inference.two_sided",
     "delta": "data.batch",
     "evaluate": "evaluation",
+    "extrapolate": "inference.extrapolate",
     "fit": "training",
+    "fit_two_sided": "inference.impute",
+    "impute": "inference.impute",
     "last_values": "data.batch",
     "load": "data.store",
     "load_checkpoint": "models.checkpoint",
+    "load_two_sided": "inference.impute",
     "make": "models.zoo",
     "parts": "data.prepare",
     "predict": "inference.predict",
@@ -57,6 +66,9 @@ _HOMES = {
     "row_0_constant": "scores",
     "save": "data.store",
     "save_checkpoint": "models.checkpoint",
+    "save_two_sided": "inference.impute",
+    "score_extrapolation": "inference.scoring",
+    "score_imputation": "inference.scoring",
     "simulate": "data.simulate",
     "split": "data.prepare",
     "split_in_time": "data.prepare",
@@ -85,12 +97,17 @@ __all__ = [
     "Scores",
     "TrainConfig",
     "Trajectory",
+    "TwoSided",
     "delta",
     "evaluate",
+    "extrapolate",
     "fit",
+    "fit_two_sided",
+    "impute",
     "last_values",
     "load",
     "load_checkpoint",
+    "load_two_sided",
     "make",
     "parts",
     "predict",
@@ -98,6 +115,9 @@ __all__ = [
     "row_0_constant",
     "save",
     "save_checkpoint",
+    "save_two_sided",
+    "score_extrapolation",
+    "score_imputation",
     "simulate",
     "split",
     "split_in_time",

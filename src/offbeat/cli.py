@@ -13,6 +13,8 @@ from typing import Any
 from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
+from offbeat.commands.extrapolate import extrapolate_command
+from offbeat.commands.impute import impute_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.simulate import simulate_command
 from offbeat.commands.train import train_command
@@ -27,6 +29,8 @@ A first way through, from simulation to a scored model:
       --model.name ode_rnn --training.epochs 5
   offbeat evaluate runs/ode_rnn hopper.parquet
   offbeat predict runs/ode_rnn hopper.parquet predictions.csv
+  offbeat impute runs/ode_rnn hopper.parquet filled.csv
+  offbeat extrapolate runs/ode_rnn hopper.parquet ahead.csv --horizons '[0.05, 0.1]'
 
 Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 
@@ -38,6 +42,8 @@ COMMANDS: dict[str, Any] = {
     "train": train_command,
     "evaluate": evaluate_command,
     "predict": predict_command,
+    "impute": impute_command,
+    "extrapolate": extrapolate_command,
     "demo": demo_command,
     "doctor": doctor_command,
 }

@@ -49,7 +49,9 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
         try:
             reader = dict(json.loads((run / READER_FILE).read_text(encoding="utf-8")))
         except (TypeError, ValueError) as error:
-            raise FileFormatError(f"{run / READER_FILE} is damaged ({error}); give --reader") from None
+            raise FileFormatError(
+                f"{run / READER_FILE} is damaged ({error}); give --reader"
+            ) from None
     return read(data, **(reader or {}))
 
 

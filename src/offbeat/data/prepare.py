@@ -15,6 +15,7 @@ from offbeat.config import PartsConfig, from_mapping
 from offbeat.data.thin import thin
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.data.windows import Cut, owned_windows
+from offbeat.data.windows import windows as windows
 from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.files import write_json
 

@@ -141,7 +141,8 @@ class NormalEquations:
         self._added += 1
         rows, channels = np.nonzero(counted)
         phi, y = terms[rows, channels], missed[rows, channels]
-        at = (fold, channels, side[rows, channels], group_of(length, self.gap_unit)[rows, channels])
+        group = group_of(length[rows, channels], self.gap_unit)
+        at: Any = (fold, channels, side[rows, channels], group)
         np.add.at(self._gram, at, phi[:, :, None] * phi[:, None, :])
         np.add.at(self._moment, at, phi * y[:, None])
         np.add.at(self._square, at, y**2)

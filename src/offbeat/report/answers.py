@@ -60,9 +60,7 @@ def answers(
     return figure
 
 
-def _channel(
-    axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], name: str
-) -> None:
+def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], name: str) -> None:
     channel = truth.names.index(name)
     hidden = hidden_cells(truth)[:, channel]
     seen = truth.observed[:, channel]
