@@ -14,13 +14,14 @@ from offbeat.commands.common import (
     read_log,
     say,
 )
+from offbeat.errors import InputError
 
 
 def extrapolate_command(
     model: Path,
     data: Path,
     out: Path,
-    horizons: list[float] | float,
+    horizons: list[float] | float | None = None,
     figure: Path | None = None,
     channels: list[str] | None = None,
     trajectory: int = 0,
@@ -51,6 +52,8 @@ def extrapolate_command(
     from offbeat.inference.extrapolate import checked_horizons, extrapolate
     from offbeat.models.checkpoint import load_checkpoint
 
+    if horizons is None:
+        raise InputError("say how far to go: --horizons 0.5 or --horizons '[0.1, 0.5, 1.0]', in s")
     check_out(out, data)
     check_figure(figure)
     after = checked_horizons(horizons)

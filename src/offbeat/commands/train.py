@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from typing import Any
 from offbeat.commands.common import READER_FILE, plain, read_log, say
 from offbeat.config import ModelConfig, PartsConfig, TrainConfig, check_seed
 from offbeat.errors import InputError, one_of
+
+LONG = 2000
+"""Rows of a training trajectory from which on it is worth a word that windows train faster."""
 
 
 def train_command(
@@ -63,6 +67,13 @@ def train_command(
     torch.set_num_threads(threads)
     dataset = read_log(data, reader)
     train_part, validation, test = cut(dataset, parts)
+    longest = max(t.rows for t in train_part)
+    if longest > LONG:
+        print(
+            f"offbeat: note: training trajectories have up to {longest} rows, each step goes "
+            "through all of them; windows train faster: --parts.window 200 --parts.cut random",
+            file=sys.stderr,
+        )
     made = make(model, train_part, scaler=scaler, seed=seed)  # type: ignore[arg-type]
     resolved = {
         "data": str(data),
