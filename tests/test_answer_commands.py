@@ -258,7 +258,7 @@ def test_the_lasa_example_runs_from_demonstrations_to_scores(tmp_path, capsys):
     example = [sys.executable, str(root / "lasa.py"), str(data), "--shapes", "Worm", "--every=20"]
     subprocess.run(example, check=True, capture_output=True)
     assert len(ob.load(data)) == 7
-    small = ["--training.epochs=1", "--parts.window=20", "--parts.window_count=1", *MODEL[:2]]
+    small = ["--training.epochs=1", *MODEL[:2]]
     arguments = ["train", f"--config={root / 'lasa.yaml'}", *small, str(data), str(out)]
     assert main(arguments) == 0
     results = json.loads((out / "results.json").read_text())
