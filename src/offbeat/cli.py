@@ -16,6 +16,8 @@ from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
 from offbeat.commands.export import export_command
+from offbeat.commands.extrapolate import extrapolate_command
+from offbeat.commands.impute import impute_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
@@ -32,6 +34,8 @@ A first way through, from simulation to a scored model:
       --model.name ode_rnn --training.epochs 5
   offbeat evaluate runs/ode_rnn hopper.parquet
   offbeat predict runs/ode_rnn hopper.parquet predictions.csv
+  offbeat impute runs/ode_rnn hopper.parquet filled.csv
+  offbeat extrapolate runs/ode_rnn hopper.parquet ahead.csv --horizons '[0.05, 0.1]'
 
 Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 
@@ -46,6 +50,8 @@ COMMANDS: dict[str, Any] = {
     "compare": compare_command,
     "stream": stream_command,
     "export": export_command,
+    "impute": impute_command,
+    "extrapolate": extrapolate_command,
     "demo": demo_command,
     "reproduce": reproduce_command,
     "doctor": doctor_command,
