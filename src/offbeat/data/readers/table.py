@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.store import require_file
+from offbeat.data.source import require_file
 from offbeat.data.trajectory import SECONDS_PER, Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError, one_of
 
