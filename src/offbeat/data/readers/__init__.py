@@ -113,8 +113,11 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
         if not known:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
         one_of(f"option of the {reader.name} reader", option, known)
-    policies = {name: options.pop(name) for name in POLICIES if name not in reader.options
-                and name in options}
+    policies = {
+        name: options.pop(name)
+        for name in POLICIES
+        if name not in reader.options and name in options
+    }
     made = reader.function(path, **options)
     if isinstance(made, Dataset):
         if policies:
@@ -141,8 +144,8 @@ def reader_of(path: Path) -> Reader:
     if suffix == FOLDER:
         known = ", ".join(reader.name for reader in fitting) or "none"
         raise FileFormatError(
-            f"{path} is a folder of no known format, expected one of: {known}; name the file inside "
-            "it, or its format with format="
+            f"{path} is a folder of no known format, expected one of: {known}; name the file "
+            "inside it, or its format with format="
         )
     if not fitting:
         named = (
