@@ -14,60 +14,54 @@ Values = NDArray[np.float64]
 HELD_SHARE = 0.5
 """Share of rows that repeat the value before them, from which on a channel can be held."""
 
-_LONGEST_RUN = 64  # runs are counted up to this length, and longer ones as this long
 _FEWEST_RUNS = 10
 _QUATERNION = re.compile(r"(.*?)(?:^|[._\s\-/]|(?<=q)|(?<=quat)|(?<=quaternion))([wxyz])")
 _ROTATION = re.compile(r"q$|quat|orient|rotation|attitude|(^|[._\s\-/])q", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Runs:
-    """How long a channel stays at one value, counted over its known cells.
+class Held:
+    """A channel of a slower sensor that a faster log repeats.
 
     Attributes:
-        cells: known cells that have one before them.
-        repeats: those that repeat the value of the one before.
-        lengths: (64,) runs of equal values by length, from 1; the last counts the longer ones, too.
+        share: of its known cells that repeat the one before.
+        rows_per_value: the usual (median) length of its runs of equal values, 2 or more.
     """
 
-    cells: int
-    repeats: int
-    lengths: NDArray[np.int64]
-
-    def __add__(self, other: Runs) -> Runs:
-        return Runs(
-            self.cells + other.cells, self.repeats + other.repeats, self.lengths + other.lengths
-        )
-
-    @property
-    def share(self) -> float:
-        """Share of the cells that repeat the one before."""
-        return self.repeats / self.cells if self.cells else 0.0
-
-    @property
-    def held(self) -> int:
-        """Rows per value of a slower sensor that a faster log repeats; 0 where it is none.
-
-        Held is a channel at least half of whose cells repeat the one before, in 10 runs or more
-        whose usual (median) length is 2 or more. One that rests at a value has long runs between
-        changes at every row, and is not held; a constant has one run.
-        """
-        runs = int(self.lengths.sum())
-        if self.share < HELD_SHARE or runs < _FEWEST_RUNS:
-            return 0
-        middle = int(np.searchsorted(np.cumsum(self.lengths), runs / 2)) + 1
-        return middle if middle >= 2 else 0
+    share: float
+    rows_per_value: int
 
 
-def count_runs(column: Values) -> Runs:
-    """Runs of equal values among the known cells of a channel, but for the last, which is cut off."""
-    known = column[~np.isnan(column)]
-    if len(known) < 2:
-        return Runs(0, 0, np.zeros(_LONGEST_RUN, dtype=np.int64))
-    changes = np.flatnonzero(known[1:] != known[:-1]) + 1
-    lengths = np.minimum(np.diff(changes, prepend=0), _LONGEST_RUN)
-    counted = np.bincount(lengths, minlength=_LONGEST_RUN + 1)[1:]
-    return Runs(len(known) - 1, len(known) - 1 - len(changes), counted)
+def find_held(columns: Sequence[Values]) -> Held | None:
+    """Says whether a channel is held.
+
+    Held is a channel at least half of whose known cells repeat the one before, in 10 runs of equal
+    values or more whose median length is 2 or more. One that rests, and between its rests changes
+    at every row, has mostly short runs, and is not held; a constant has no run that ends.
+
+    Args:
+        columns: (rows,) its values in each episode, NaN = missing.
+    """
+    columns = [_known(column) for column in columns]
+    cells = sum(len(column) - 1 for column in columns if len(column))
+    repeats = sum(int(np.count_nonzero(column[1:] == column[:-1])) for column in columns)
+    if not cells or repeats < HELD_SHARE * cells:
+        return None
+    lengths: list[NDArray[np.int64]] = []
+    for column in columns:
+        if len(column):
+            changes = np.flatnonzero(column[1:] != column[:-1]) + 1
+            lengths.append(np.diff(changes, prepend=0))  # without the last run, which is cut off
+    runs = np.concatenate(lengths)
+    if len(runs) < _FEWEST_RUNS:
+        return None
+    usual = int(np.median(runs))
+    return Held(repeats / cells, usual) if usual >= 2 else None
+
+
+def _known(column: Values) -> Values:
+    missing = np.isnan(column)
+    return column[~missing] if missing.any() else column
 
 
 def measured_anew(column: Values, held: int) -> NDArray[np.bool_]:

@@ -31,8 +31,8 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
     """Makes a data set of recordings: merges their signals and applies the policies.
 
     In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
-    outages; held values, angles and quaternions per episode; resampling. A channel is held or not over all
-    recordings together.
+    outages; held values, angles and quaternions per episode; resampling. Whether a channel is held
+    is found over all recordings together.
 
     Memory: the arrays of a recording with one signal and no fault become those of its trajectory;
     else there is, beside the result, one copy of the recordings at most.
@@ -90,16 +90,14 @@ def _mask_held(
     episodes: list[Episode], channels: Channels, policies: Policies, account: Account
 ) -> None:
     for c, name in enumerate(channels.names):
-        runs = mend.count_runs(episodes[0].values[:, c])
-        for episode in episodes[1:]:
-            runs += mend.count_runs(episode.values[:, c])
-        if not runs.held:
+        held = mend.find_held([episode.values[:, c] for episode in episodes])
+        if held is None:
             continue
-        account.held[name] = {"share": round(runs.share, 4), "rows_per_value": runs.held}
+        account.held[name] = {"share": held.share, "rows_per_value": held.rows_per_value}
         if policies.held == "mask":
             for episode in episodes:
                 column = episode.own()[:, c]
-                repeats = ~mend.measured_anew(column, runs.held) & ~np.isnan(column)
+                repeats = ~mend.measured_anew(column, held.rows_per_value) & ~np.isnan(column)
                 column[repeats] = np.nan
                 account.masked += int(repeats.sum())
 
