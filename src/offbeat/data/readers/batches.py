@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,20 @@ class NullCellError(Exception):
         self.column, self.row = column, row
 
 
-def gather(batches: Iterable[Any], columns: Columns, capacity: int) -> Gathered:
+def gather(
+    batches: Iterable[Any],
+    columns: Columns,
+    capacity: int,
+    *,
+    widths: Mapping[str, int] = MappingProxyType({}),
+) -> Gathered:
     """Copies the columns that are needed out of record batches, one batch at a time.
 
     Args:
         batches: `pyarrow.RecordBatch`es with the columns `columns.read`.
         columns: what they are.
         capacity: at least the number of rows; what is too much costs address space alone.
+        widths: how many channels a column of lists gives.
 
     Raises:
         NullCellError: a time, label or key is missing.
@@ -35,7 +43,8 @@ def gather(batches: Iterable[Any], columns: Columns, capacity: int) -> Gathered:
         OverflowError: a time of decimals exceeds an int64 of nanoseconds.
     """
     # Columns lie one after the other, so that each is filled and looked at in one stretch.
-    values = np.empty((len(columns.channels), capacity))
+    channels = sum(widths.get(name, 1) for name in columns.channels)
+    values = np.empty((channels, capacity))
     clocks: list[NDArray[Any]] = []
     labels = Coder() if columns.label else None
     keys = Coder() if columns.key else None
@@ -46,8 +55,13 @@ def gather(batches: Iterable[Any], columns: Columns, capacity: int) -> Gathered:
                 coder.add(_without_nulls(_text(batch.column(name)), name, rows))
         clocks.append(clock_of(_without_nulls(batch.column(columns.time), columns.time, rows)))
         end = rows + batch.num_rows
-        for c, name in enumerate(columns.channels):
-            values[c, rows:end] = _numbers(batch.column(name))
+        c = 0
+        for name in columns.channels:
+            column, width = batch.column(name), widths.get(name, 1)
+            values[c : c + width, rows:end] = (
+                _lists(column, name, width) if name in widths else _numbers(column)
+            )
+            c += width
         rows = end
     clock = np.concatenate(clocks) if clocks else np.zeros(0, dtype=np.int64)
     return Gathered(
@@ -85,6 +99,23 @@ def _numbers(column: Any) -> NDArray[Any]:
     if not pa.types.is_float64(column.type):
         column = column.cast(pa.float64(), safe=False)
     return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+def _lists(column: Any, name: str, width: int) -> NDArray[Any]:
+    """(width, rows) of a column of lists, null = NaN."""
+    import pyarrow.compute as pc
+
+    there = column.is_valid().to_numpy(zero_copy_only=False)
+    lists = column.drop_null()
+    lengths = pc.list_value_length(lists).to_numpy(zero_copy_only=False)
+    if (lengths != width).any():
+        raise FileFormatError(
+            f"column {name!r} holds lists of {width} values and of {lengths[lengths != width][0]}, "
+            "expected one length; choose the columns that are channels with channels="
+        )
+    spread = np.full((width, len(column)), np.nan)
+    spread[:, there] = _numbers(lists.flatten()).reshape(-1, width).T
+    return spread
 
 
 def _text(column: Any) -> Any:

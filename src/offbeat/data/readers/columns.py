@@ -214,6 +214,11 @@ class Coder:
         )
         self._codes.append(codes[coded.indices.to_numpy(zero_copy_only=False)])
 
+    def add_texts(self, texts: Sequence[str]) -> None:
+        """Adds texts, one per row."""
+        codes = [self._of.setdefault(text, len(self._of)) for text in texts]
+        self._codes.append(np.array(codes, dtype=np.int64))
+
     def done(self) -> Coded:
         """All rows."""
         return Coded(np.concatenate([*self._codes, np.zeros(0, np.int64)]), list(self._of))
