@@ -102,6 +102,7 @@ class Episode:
     owned: bool  # whether values may be written to
     recording: Recording = field(repr=False)
     part: str = ""
+    faults: dict[str, float] = field(default_factory=dict)  # found here, by what they are called
 
     @property
     def label(self) -> str:
@@ -148,7 +149,8 @@ def cut(
     bare = Recording(
         (), recording.label, recording.origin, recording.time_unit, clock_zero=recording.clock_zero
     )
-    for piece in _pieces(signals, recording, policies, account):
+    for number, piece in enumerate(_pieces(signals, recording, policies, account)):
+        disorders = [faults.disorder(signal.stamps) for signal in piece]
         ordered = [_ordered(signal, recording, policies, account) for signal in piece]
         columns = [[channels.columns[s.name, c] for c in s.channels] for s in piece]
         stamps, values = faults.union(
@@ -169,7 +171,13 @@ def cut(
             cuts = np.flatnonzero(steps > limit) + 1
             account.outages_s += (steps[cuts - 1] / 1e9).tolist()
         for start, end in zip([0, *cuts], [*cuts, len(stamps)], strict=True):
-            found.append(Episode(stamps[start:end], values[start:end], owned, bare))
+            episode = Episode(stamps[start:end], values[start:end], owned, bare)
+            episode.faults = _faults_in(episode.stamps, disorders)
+            if start:
+                episode.faults["outage_before_s"] = float(stamps[start] - stamps[start - 1]) / 1e9
+            elif number:
+                episode.faults["clock_set_before"] = 1
+            found.append(episode)
     if len(found) == 1:
         return found
     long = [episode for episode in found if len(episode.stamps) >= policies.min_rows]
@@ -177,6 +185,17 @@ def cut(
     for k, episode in enumerate(long, 1):
         episode.part = str(k)
     return long
+
+
+def _faults_in(stamps: NDArray[np.int64], disorders: Iterable[faults.Disorder]) -> dict[str, float]:
+    """How many rows between the first and the last stamp came late, or repeat one."""
+    counts: dict[str, float] = {}
+    for found in disorders:
+        for name, at in (("late", found.late), ("duplicates", found.duplicates)):
+            count = int(((at >= stamps[0]) & (at <= stamps[-1])).sum()) if len(at) else 0
+            if count:
+                counts[name] = counts.get(name, 0) + count
+    return counts
 
 
 def _pieces(
@@ -218,10 +237,10 @@ def _ordered(
     signal: Signal, recording: Recording, policies: Policies, account: Account
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     found = faults.disorder(signal.stamps)
-    if not (found.late or found.duplicates):
+    if not found.any:
         return signal.stamps, signal.values
-    refused = (found.late and policies.order == "refuse") or (
-        found.duplicates and policies.duplicates == "refuse"
+    refused = (len(found.late) and policies.order == "refuse") or (
+        len(found.duplicates) and policies.duplicates == "refuse"
     )
     if refused:
         stamps = signal.stamps
@@ -234,11 +253,13 @@ def _ordered(
             f"{row}; order=sort sorts late rows in, duplicates=last merges those of one stamp"
         )
     name = signal.name or (signal.channels[0] if len(signal.channels) == 1 else "rows")
-    account.late[name] += found.late
+    if len(found.late):
+        account.late[name] += len(found.late)
     stamps, values = faults.in_order(signal.stamps, signal.values, policies.order)
     before = len(stamps)
     stamps, values = faults.one_row_per_stamp(stamps, values, policies.duplicates)
-    account.duplicates[name] += before - len(stamps)
+    if before > len(stamps):
+        account.duplicates[name] += before - len(stamps)
     return stamps, values
 
 

@@ -141,8 +141,13 @@ class Account:
     dropped: int = 0
     notes: dict[str, None] = field(default_factory=dict)
 
-    def report(self, policies: Policies) -> dict[str, Any]:
-        """Policy and finding of each kind of fault, JSON-like."""
+    def report(self, policies: Policies, episodes: list[dict[str, float]]) -> dict[str, Any]:
+        """Policy and finding of each kind of fault, JSON-like.
+
+        Args:
+            policies: that were applied.
+            episodes: of the trajectories with faults, the number and what was found there.
+        """
         p = policies
         limits = [min(self.limits_s), max(self.limits_s)] if self.limits_s else None
         return {
@@ -176,6 +181,7 @@ class Account:
                 "dropped": self.dropped,
             },
             "resample_hz": p.resample_hz,
+            "episodes": episodes,
             "notes": list(self.notes),
         }
 
@@ -229,7 +235,7 @@ def sentences(report: Mapping[str, Any]) -> list[str]:
             f"{sum(turns.values())} jumps by a turn were taken out of {_listed(list(turns))}"
         )
     quaternions = report["quaternions"]
-    if quaternions["channels"]:
+    if any(quaternions[fault] for fault in ("flipped", "renormalised", "dropped")):
         said.append(
             f"quaternions {_listed(['/'.join(four) for four in quaternions['channels']])}: "
             f"{quaternions['flipped']} rows changed sign, {quaternions['renormalised']} had "

@@ -83,7 +83,8 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
     starts = [_clock(episode, unit) for episode in episodes]
     if policies.start == "first_row" and any(starts):
         meta["clock_start"] = starts
-    return Dataset(trajectories, {**meta, "report": account.report(policies)})
+    faulty = [{"episode": i, **e.faults} for i, e in enumerate(episodes) if e.faults]
+    return Dataset(trajectories, {**meta, "report": account.report(policies, faulty)})
 
 
 def _mask_held(
