@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -146,9 +146,7 @@ def cut(
         account.empty += 1
         return []
     found: list[Episode] = []
-    bare = Recording(
-        (), recording.label, recording.origin, recording.time_unit, clock_zero=recording.clock_zero
-    )
+    bare = replace(recording, signals=(), notes=())
     for number, piece in enumerate(_pieces(signals, recording, policies, account)):
         disorders = [faults.disorder(signal.stamps) for signal in piece]
         ordered = [_ordered(signal, recording, policies, account) for signal in piece]
