@@ -147,8 +147,7 @@ def cut(
         return []
     found: list[Episode] = []
     bare = replace(recording, signals=(), notes=())
-    for number, piece in enumerate(_pieces(signals, recording, policies, account)):
-        disorders = [faults.disorder(signal.stamps) for signal in piece]
+    for piece in _pieces(signals, recording, policies, account):
         ordered = [_ordered(signal, recording, policies, account) for signal in piece]
         columns = [[channels.columns[s.name, c] for c in s.channels] for s in piece]
         stamps, values = faults.union(
@@ -161,6 +160,7 @@ def cut(
                 values, infinite, owned, recording, channels, policies, account
             )
         del infinite
+        disorders = [faults.disorder(signal.stamps) for signal in piece]
         limit = faults.longest_allowed(stamps, policies.max_gap_s)
         cuts = np.zeros(0, dtype=np.int64)
         if limit is not None:
@@ -173,7 +173,7 @@ def cut(
             episode.faults = _faults_in(episode.stamps, disorders)
             if start:
                 episode.faults["outage_before_s"] = float(stamps[start] - stamps[start - 1]) / 1e9
-            elif number:
+            elif found:
                 episode.faults["clock_set_before"] = 1
             found.append(episode)
     if len(found) == 1:
