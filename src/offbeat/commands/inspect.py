@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,12 @@ def inspect_command(
     if out is not None:
         one_of("suffix of out", out.suffix.lower(), (".png", ".pdf", ".svg"))
         writable(out)
-    dataset = read(data, **(reader or {}))
+    # What is noted aloud while reading stands in the output, too; once is enough.
+    logging.getLogger("offbeat").addFilter(_silence)
+    try:
+        dataset = read(data, **(reader or {}))
+    finally:
+        logging.getLogger("offbeat").removeFilter(_silence)
     inspection = inspect(dataset)
     known = options_of(READERS[inspection.format]) if inspection.format in READERS else ()
     advice = advise(inspection, str(data), str(run), reader=reader, known=known)
@@ -46,6 +52,10 @@ def inspect_command(
         save(log(dataset, inspection, title=data.name), out)
         result["figure"] = str(out)
     say(result, _text(inspection, advice, out), json)
+
+
+def _silence(record: logging.LogRecord) -> bool:
+    return record.levelno > logging.WARNING
 
 
 def _text(inspection: Any, advice: Any, out: Path | None) -> str:

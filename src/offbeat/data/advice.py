@@ -73,7 +73,7 @@ def advise(
             "had been measured, and is not an easy hit for the last value"
         )
     words = [f"--reader.{name}={_text(value)}" for name, value in options.items()]
-    parts, why = _parts(inspection, useful)
+    parts, why = _parts(inspection, useful, options.get("held") == "mask" and bool(held))
     reasons += why
     words += [f"--parts.{name}={chosen}" for name, chosen in parts.items()]
     words.append("--model.name=anchored_ode_gru_d")
@@ -81,7 +81,7 @@ def advise(
 
 
 def _parts(
-    inspection: Inspection, useful: Sequence[ChannelFacts]
+    inspection: Inspection, useful: Sequence[ChannelFacts], masked: bool
 ) -> tuple[dict[str, Any], list[str]]:
     parts: dict[str, Any] = {}
     reasons: list[str] = []
@@ -89,11 +89,8 @@ def _parts(
     parts["window"] = rows
     rates = [channel.rate_hz for channel in useful if channel.rate_hz]
     slowest = f" of the slowest channel, at {min(rates):.3g} Hz" if rates else ""
-    reasons.append(
-        f"window: {rows} rows, about {_cells(inspection, rows, rates):.0f} cells{slowest}"
-        if rates
-        else f"window: {rows} rows"
-    )
+    cells = f", about {_cells(inspection, rows, rates):.0f} cells{slowest}" if rates else ""
+    reasons.append(f"window: {rows} rows{cells}")
     episodes = len(inspection.episodes)
     if episodes >= _FEWEST_EPISODES:
         parts["cut"] = "consecutive"
@@ -108,7 +105,7 @@ def _parts(
     gaps = sorted(c.longest_gap_s for c in useful if c.longest_gap_s is not None)
     gap = gaps[len(gaps) // 2] if gaps else 0.0
     usual = 1 / min(rates) if rates else 0.0
-    uneven = len({round(channel.missing, 4) for channel in useful}) > 1
+    uneven = masked or len({round(channel.missing, 4) for channel in useful}) > 1
     if uneven:
         parts["hide"] = "dropout"
         silence = max(min(gap, 20 * usual), 3 * usual)

@@ -17,6 +17,9 @@ from offbeat.data.trajectory import Trajectory
 from offbeat.errors import FileFormatError, InputError, one_of
 
 
+_DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
+
+
 @dataclass(frozen=True)
 class Channels:
     """The channels of all recordings together, in the order in which they were first met."""
@@ -33,7 +36,7 @@ class Channels:
 
         Raises:
             FileFormatError: there is no channel, names repeat, or units disagree.
-            InputError: `angles` names a channel that there is not.
+            InputError: `channels` or `angles` names a channel that there is not.
         """
         if not recordings:
             raise FileFormatError("there is nothing recorded to read; check the file")
@@ -71,22 +74,33 @@ class Channels:
             raise FileFormatError("there is no channel to read, only times")
         for name in policies.angles:
             kinds[names.index(one_of("channel in angles", name, names))] = "angle"
+        chosen = policies.channels or names
+        kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
         fours = [at for at, kind in enumerate(kinds) if kind == "quaternion"]
+        whole = [fours[i : i + 4] for i in range(0, len(fours), 4)]
         return cls(
-            names,
-            tuple(units),
-            columns,
+            tuple(chosen),
+            tuple(units[at] for at in kept),
+            {key: kept[at] for key, at in columns.items() if at in kept},
             {
-                at: 360.0
-                if units[at].casefold() in ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
-                else 2 * np.pi
+                kept[at]: 360.0 if units[at].casefold() in _DEGREES else 2 * np.pi
                 for at, kind in enumerate(kinds)
-                if kind == "angle"
+                if kind == "angle" and at in kept
             },
-            tuple(tuple(fours[i : i + 4]) for i in range(0, len(fours), 4))
-            if policies.quaternions == "continuous"
-            else (),
+            tuple(
+                tuple(kept[at] for at in four)
+                for four in whole
+                if policies.quaternions == "continuous" and all(at in kept for at in four)
+            ),
         )
+
+    def keep(self, signal: Signal) -> Signal | None:
+        """The signal with those of its channels that are kept, or None."""
+        at = [i for i, name in enumerate(signal.channels) if (signal.name, name) in self.columns]
+        if len(at) == len(signal.channels):
+            return signal
+        names = tuple(signal.channels[i] for i in at)
+        return Signal(signal.name, signal.stamps, signal.values[:, at], names) if at else None
 
     def names_of(self, columns: Iterable[int]) -> tuple[str, ...]:
         """The names of some columns."""
@@ -141,7 +155,8 @@ def cut(
     recording: Recording, channels: Channels, policies: Policies, account: Account
 ) -> list[Episode]:
     """The episodes of a recording: its clocks mended, its signals merged, split at outages."""
-    signals = [signal for signal in recording.signals if len(signal.stamps)]
+    kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
+    signals = [signal for signal in kept if signal is not None]
     if not signals:
         account.empty += 1
         return []

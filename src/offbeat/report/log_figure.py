@@ -20,6 +20,7 @@ _WIDTH = 7.0  # inches, two columns of a journal
 _BINS = 1400
 _MOST_LANES = 40
 _USUAL = 1.5  # a time between cells up to this many median ones is no gap
+_MARKED, _MOST_MARKS = 3.0, 50  # the longest gaps of more than this many median ones have a mark
 _MEASURED, _HELD, _GAP = "#0072B2", "#E69F00", "#D55E00"
 
 
@@ -36,7 +37,8 @@ def log(dataset: Dataset, inspection: Inspection, *, title: str = "") -> Figure:
 
     Above, a lane per channel, or per group of channels that were always measured together: full
     colour where the channel's own rate is met, white where it is silent for longer than 1.5 times
-    its median step. Episodes stand where the recording's clock has them, with their outages marked,
+    its median step; its 50 longest gaps of more than 3 median steps are marked, for they may be
+    narrower than a dot of the picture. Episodes stand where the recording's clock has them, with their outages marked,
     or one after the other where they have no clock in common. Below, the longest time between two
     rows in each of 1400 equal stretches of time.
 
@@ -153,6 +155,8 @@ def _draw_lane(
             aspect="auto",
             interpolation="none",
         )
+        gaps = _marks(dataset, lane.channels[0], 1 / facts.rate_hz, starts)
+        axes.vlines(gaps, row - 0.46, row + 0.46, color=_GAP, linewidth=0.7)
     rate = "" if facts.rate_hz is None else f"{facts.rate_hz:.3g} Hz, "
     gap = "" if facts.longest_gap_s is None else f", gap {facts.longest_gap_s:.2g} s"
     axes.text(
@@ -194,6 +198,21 @@ def _covered(
     return share
 
 
+def _marks(
+    dataset: Dataset, channel: int, step: float, starts: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Where the longest gaps begin, on the axis."""
+    begins, lengths = [], []
+    for trajectory, start in zip(dataset, starts, strict=True):
+        at = trajectory.times[~np.isnan(trajectory.values[:, channel])]
+        steps = np.diff(at)
+        long = steps > _MARKED * step
+        begins.append(at[:-1][long] - trajectory.times[0] + start)
+        lengths.append(steps[long])
+    order = np.argsort(-np.concatenate(lengths), kind="stable")[:_MOST_MARKS]
+    return np.asarray(np.concatenate(begins)[order])
+
+
 def _mark_episodes(
     axes: Axes,
     dataset: Dataset,
@@ -211,6 +230,8 @@ def _mark_episodes(
 def _draw_steps(
     axes: Axes, dataset: Dataset, starts: NDArray[np.float64], edges: NDArray[np.float64]
 ) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     longest = np.full(len(edges) - 1, np.nan)
     for trajectory, start in zip(dataset, starts, strict=True):
         if trajectory.rows < 2:
@@ -230,11 +251,17 @@ def _draw_steps(
         color="#333333",
         rasterized=True,
     )
-    axes.set_yscale("log")
+    if there.any():
+        axes.set_yscale("log")
+        axes.set_ylim(np.nanmin(longest) / 1.6, np.nanmax(longest) * 1.6)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("Longest step\nbetween rows (s)", fontsize=8)
 
 
 def _legend(figure: Figure, lanes: list[_Lane], outages: bool) -> None:
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     shown: list[Any] = []
@@ -243,8 +270,9 @@ def _legend(figure: Figure, lanes: list[_Lane], outages: bool) -> None:
     if any(lane.held for lane in lanes):
         shown.append(Patch(color=_HELD, label="measured, values held"))
     shown.append(Patch(facecolor="white", edgecolor="#999999", linewidth=0.6, label="silent"))
+    shown.append(Line2D([], [], color=_GAP, linewidth=0.9, label="a long gap begins"))
     if outages:
-        shown.append(Patch(color=_GAP, alpha=0.18, label="between episodes"))
+        shown.append(Patch(color=_GAP, alpha=0.18, label="outage, between episodes"))
     figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), fontsize=8)
 
 

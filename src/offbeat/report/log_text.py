@@ -34,7 +34,7 @@ def channel_table(inspection: Inspection) -> str:
                 c.name,
                 c.unit,
                 _number(c.rate_hz, 4),
-                _number(None if c.jitter_s is None else 1000 * c.jitter_s, 3),
+                _number(None if c.jitter_s is None else round(1000 * c.jitter_s, 4), 3),
                 f"{100 * c.missing:.1f}",
                 f"{100 * c.lost:.1f}",
                 _number(c.longest_gap_s, 4),
@@ -110,7 +110,9 @@ def _is_faulty(episode: EpisodeFacts) -> bool:
 
 
 def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}g}"
+    if value is None:
+        return ""
+    return f"{value if abs(value) >= 1e-6 else 0.0:.{digits}g}"
 
 
 def _table(rows: Sequence[Sequence[str]], left: Sequence[int]) -> str:
