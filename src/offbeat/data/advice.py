@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ def advise(
     out: str = "runs/log",
     *,
     reader: Mapping[str, Any] | None = None,
-    known: Sequence[str] = ("channels", "held"),
+    known: Sequence[str] = ("without", "held"),
 ) -> Advice:
     """Says what to pass to `train`.
 
@@ -57,13 +58,12 @@ def advise(
     reasons: list[str] = []
     useful = [channel for channel in inspection.channels if channel.cells and not channel.constant]
     useless = [channel.name for channel in inspection.channels if channel not in useful]
-    if useless and useful:
-        why = f"{_listed(useless)} never change or are never measured"
-        if "channels" in known:
-            options["channels"] = [channel.name for channel in useful]
-            reasons.append(f"channels: {why}, so there is nothing to learn of them")
-        else:
-            reasons.append(f"{why}: leave them out when the log is read")
+    if useless and useful and "without" in known:
+        options["without"] = [*options.get("without", ()), *useless]
+        reasons.append(
+            f"without: {_listed(useless)} never change or are never measured, so there is nothing "
+            "to learn of them"
+        )
     useful = useful or list(inspection.channels)
     held = [channel.name for channel in useful if channel.rows_per_value]
     if held and "held" in known and "held" not in options:
@@ -73,8 +73,8 @@ def advise(
             "had been measured, and is not an easy hit for the last value"
         )
     words = [f"--reader.{name}={_text(value)}" for name, value in options.items()]
-    parts, why = _parts(inspection, useful, options.get("held") == "mask" and bool(held))
-    reasons += why
+    parts, for_parts = _parts(inspection, useful, options.get("held") == "mask" and bool(held))
+    reasons += for_parts
     words += [f"--parts.{name}={chosen}" for name, chosen in parts.items()]
     words.append("--model.name=anchored_ode_gru_d")
     return Advice(("offbeat", "train", data, out, *words), tuple(reasons))
@@ -149,7 +149,7 @@ def _text(value: Any) -> str:
 def _quoted(text: str) -> str:
     """As YAML reads it."""
     plain = text.replace("_", "").replace(".", "").isalnum() and text[0].isalpha()
-    return text if plain else "'" + text.replace("'", "''") + "'"
+    return text if plain else json.dumps(text)
 
 
 def _listed(names: Sequence[str], most: int = 6) -> str:

@@ -16,7 +16,6 @@ from offbeat.data.signals import Recording, Signal
 from offbeat.data.trajectory import Trajectory
 from offbeat.errors import FileFormatError, InputError, one_of
 
-
 _DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
 
 
@@ -36,7 +35,7 @@ class Channels:
 
         Raises:
             FileFormatError: there is no channel, names repeat, or units disagree.
-            InputError: `channels` or `angles` names a channel that there is not.
+            InputError: `channels`, `without` or `angles` names a channel that there is not.
         """
         if not recordings:
             raise FileFormatError("there is nothing recorded to read; check the file")
@@ -74,12 +73,15 @@ class Channels:
             raise FileFormatError("there is no channel to read, only times")
         for name in policies.angles:
             kinds[names.index(one_of("channel in angles", name, names))] = "angle"
-        chosen = policies.channels or names
+        left_out = {one_of("channel in without", name, names) for name in policies.without}
+        chosen = tuple(name for name in policies.channels or names if name not in left_out)
+        if not chosen:
+            raise InputError(f"there are no channels but those to be left out: {', '.join(names)}")
         kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
         fours = [at for at, kind in enumerate(kinds) if kind == "quaternion"]
         whole = [fours[i : i + 4] for i in range(0, len(fours), 4)]
         return cls(
-            tuple(chosen),
+            chosen,
             tuple(units[at] for at in kept),
             {key: kept[at] for key, at in columns.items() if at in kept},
             {

@@ -22,6 +22,7 @@ class Policies:
     Attributes:
         channels: names of the channels to keep, as a data set of all would call them, in the order
             wanted; None keeps all. Rows in which none of them was logged are not read.
+        without: names of channels to leave out.
         order: rows whose stamp is lower than one before it: `sort` them in, `drop` them, or
             `refuse` the file.
         duplicates: of the known cells of a channel at one stamp the `last` or `first` one logged,
@@ -50,6 +51,7 @@ class Policies:
     """
 
     channels: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()
     order: Literal["sort", "drop", "refuse"] = "sort"
     duplicates: Literal["last", "first", "mean", "refuse"] = "last"
     clock_jumps: Literal["split", "join", "refuse"] = "split"
@@ -76,7 +78,11 @@ class Policies:
                 f"resample_hz must be above 0 and at most 1e9, or None to leave the rows where "
                 f"they are, got {rate!r}"
             )
-        for name, names in (("channels", self.channels), ("angles", self.angles)):
+        for name, names in (
+            ("channels", self.channels),
+            ("without", self.without),
+            ("angles", self.angles),
+        ):
             if names is None:
                 continue
             if isinstance(names, str) or not all(isinstance(one, str) for one in names):

@@ -49,7 +49,7 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
 
     Raises:
         FileFormatError: a policy refuses, or nothing is left.
-        InputError: `channels` or `angles` names a channel that there is not.
+        InputError: `channels`, `without` or `angles` names a channel that there is not.
     """
     waiting: list[Recording | None] = list(recordings)
     given = [recording for recording in waiting if recording is not None]

@@ -37,10 +37,11 @@ def log(dataset: Dataset, inspection: Inspection, *, title: str = "") -> Figure:
 
     Above, a lane per channel, or per group of channels that were always measured together: full
     colour where the channel's own rate is met, white where it is silent for longer than 1.5 times
-    its median step; its 50 longest gaps of more than 3 median steps are marked, for they may be
-    narrower than a dot of the picture. Episodes stand where the recording's clock has them, with their outages marked,
-    or one after the other where they have no clock in common. Below, the longest time between two
-    rows in each of 1400 equal stretches of time.
+    its median step. Its 50 longest gaps of more than 3 median steps are marked, for they may be
+    narrower than a dot of the picture. Episodes stand where the recording's clock has them, with
+    their outages marked, or one after the other where they have no clock in common.
+
+    Below, the longest time between two rows in each of 1400 equal stretches of time.
 
     Args:
         dataset: as it was inspected.

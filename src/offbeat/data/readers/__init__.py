@@ -132,7 +132,7 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
 
 def options_of(reader: Reader) -> list[str]:
     """All options of a format: its own, and the policies where they apply."""
-    return [*reader.options, *(POLICIES if reader.policies else ())]
+    return list(dict.fromkeys([*reader.options, *(POLICIES if reader.policies else ())]))
 
 
 def reader_of(path: Path) -> Reader:
