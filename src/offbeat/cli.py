@@ -18,6 +18,7 @@ from offbeat.commands.evaluate import evaluate_command
 from offbeat.commands.export import export_command
 from offbeat.commands.extrapolate import extrapolate_command
 from offbeat.commands.impute import impute_command
+from offbeat.commands.inspect import inspect_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
@@ -44,6 +45,7 @@ Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 # lazy package `offbeat`, and import torch to look at them.
 COMMANDS: dict[str, Any] = {
     "simulate": simulate_command,
+    "inspect": inspect_command,
     "train": train_command,
     "evaluate": evaluate_command,
     "predict": predict_command,

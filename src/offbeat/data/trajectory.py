@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from offbeat.errors import InputError, one_of
 
-SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
 """Units of time that input may be given in; inside, times are seconds."""
 
 
@@ -125,7 +125,7 @@ class Trajectory:
         Args:
             times: (rows,) in `time_unit`.
             values: (rows, channels) NaN where not known.
-            time_unit: one of `s`, `ms`, `us`, `ns`.
+            time_unit: one of `s`, `ms`, `us`, `100ns` (ticks of Windows), `ns`.
             **fields: the other fields of `Trajectory`.
 
         Raises:
