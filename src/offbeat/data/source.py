@@ -57,7 +57,9 @@ def require_source(path: str | Path) -> Path:
     try:
         empty = next(path.iterdir(), None) is None
     except OSError as error:
-        raise FileFormatError(f"{path} can't be read ({error.strerror}); check its rights") from None
+        raise FileFormatError(
+            f"{path} can't be read ({error.strerror}); check its rights"
+        ) from None
     if empty:
         raise FileFormatError(f"{path} is an empty folder, expected a data set inside")
     return path

@@ -113,8 +113,11 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
         if not known:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
         one_of(f"option of the {reader.name} reader", option, known)
-    policies = {name: options.pop(name) for name in POLICIES if name not in reader.options
-                and name in options}
+    policies = {
+        name: options.pop(name)
+        for name in POLICIES
+        if name not in reader.options and name in options
+    }
     made = reader.function(path, **options)
     if isinstance(made, Dataset):
         if policies:
