@@ -1,210 +1,44 @@
-"""What a reader hands over, and how it becomes a data set.
+"""How recordings become a data set, whatever the format of their file.
 
-A reader of a file format says what stands in the file, as it was logged: a `Recording` per file or
-episode, with a `Signal` per sensor, topic or table. Whatever is to be decided about faults of
-clocks and sensors is decided here, once for all formats, by `Policies`; `assemble` applies them,
-counts what each did, and merges signals of different rates on the union of their stamps.
+A reader says what stands in a file, as it was logged: a `Recording` per file or episode, with a
+`Signal` per sensor, topic or table. Whatever is to be decided about faults of clocks and sensors
+is decided here, once for all formats, by `Policies`; `assemble` applies them, counts what each did,
+and merges signals of different rates on the union of their stamps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from offbeat.data.trajectory import SECONDS_PER, Dataset
-from offbeat.errors import InputError, one_of
+from offbeat.data import faults, mend
+from offbeat.data.clock import NANOSECONDS_PER
+from offbeat.data.merging import Channels, Episode, cut
+from offbeat.data.policies import Account
+from offbeat.data.policies import Policies as Policies
+from offbeat.data.signals import Recording as Recording
+from offbeat.data.signals import Signal as Signal
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import FileFormatError
 
-KINDS = ("", "angle", "quaternion")
-"""What a channel can be, beyond a number."""
-
-
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """What one sensor, topic or table said, as it was logged: faults are still inside.
-
-    Args:
-        name: of the topic or table. Channels are called `name.channel` where several signals are
-            merged, and `channel` where there is only one.
-        stamps: (n,) nanoseconds on the recording's clock, int64, in the order of the log.
-        values: (n, channels) float64, NaN = missing. A view of columns that lie one after the
-            other in memory (order F) is welcome: nothing is copied without need.
-        channels: a name per channel.
-        units: a unit per channel, such as `rad/s`; by default empty.
-        kinds: per channel `""`, `angle` (rad, or degrees where its unit is `deg`) or `quaternion`
-            (four channels in a row are one quaternion); by default `""`. A reader sets what it
-            knows.
-
-    Raises:
-        InputError: shapes, types or numbers of names disagree.
-    """
-
-    name: str
-    stamps: NDArray[np.int64]
-    values: NDArray[np.float64]
-    channels: tuple[str, ...]
-    units: tuple[str, ...] = ()
-    kinds: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        where = f" of signal {self.name!r}" if self.name else ""
-        width = len(self.channels)
-        units = tuple(self.units) or ("",) * width
-        kinds = tuple(self.kinds) or ("",) * width
-        if self.stamps.dtype != np.int64 or self.stamps.ndim != 1:
-            raise InputError(
-                f"stamps{where} must be int64 nanoseconds of shape (n,), got {self.stamps.dtype} "
-                f"of shape {self.stamps.shape}"
-            )
-        if self.values.dtype != np.float64 or self.values.shape != (len(self.stamps), width):
-            raise InputError(
-                f"values{where} must be float64 of shape {(len(self.stamps), width)}, a row per "
-                f"stamp and a column per channel, got {self.values.dtype} of shape "
-                f"{self.values.shape}"
-            )
-        if len(units) != width or len(kinds) != width:
-            raise InputError(
-                f"got {len(units)} units and {len(kinds)} kinds for {width} channels{where}; "
-                "give one of each per channel"
-            )
-        for kind in kinds:
-            one_of("kind of channel", kind, KINDS)
-        if kinds.count("quaternion") % 4:
-            raise InputError(
-                f"{kinds.count('quaternion')} channels{where} are called quaternion; four in a "
-                "row make one"
-            )
-        object.__setattr__(self, "channels", tuple(self.channels))
-        object.__setattr__(self, "units", units)
-        object.__setattr__(self, "kinds", kinds)
+DEFAULT = Policies()
+"""The safe defaults."""
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """One file or one episode: signals on one clock, before any policy.
-
-    Args:
-        signals: what was logged; a signal may be empty.
-        label: of the episode, where the file has one.
-        origin: where it came from, for messages and reports.
-        time_unit: the unit that the file itself counts in, for reports: `s`, `ms`, `us`, `ns` or
-            `100ns`.
-        notes: what is to be said aloud about how it was read, such as "stamps are row number /
-            fps".
-
-    Raises:
-        InputError: the unit is unknown.
-    """
-
-    signals: tuple[Signal, ...]
-    label: str = ""
-    origin: str = ""
-    time_unit: str = "ns"
-    notes: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        one_of("time unit", self.time_unit, SECONDS_PER)
-        object.__setattr__(self, "signals", tuple(self.signals))
-        object.__setattr__(self, "notes", tuple(self.notes))
-
-
-@dataclass(frozen=True)
-class Policies:
-    """What is done about the faults of clocks and sensors; each is an option of `read`.
-
-    The defaults lose nothing that was measured and make nothing up. What each of them did is
-    counted in `Dataset.meta["report"]`.
-
-    Attributes:
-        order: rows whose stamp is lower than one before it: `sort` them in, `drop` them, or
-            `refuse` the file.
-        duplicates: of the known cells of a channel at one stamp the `last` or `first` one logged,
-            their `mean`, or `refuse` the file.
-        clock_jumps: where a clock was set back, or forth by more than a day, while it was logged:
-            `split` into episodes, `join` as if the rows only lacked order, or `refuse` the file.
-        max_gap_s: a longer time without any row is an outage, and splits into episodes. `auto` is
-            20 times the 99th percentile of the steps between rows, and at least 1 s; None never
-            splits.
-        min_rows: an episode that a split leaves with fewer rows than this is left out.
-        held: channels of a slower sensor that a faster log repeats: `keep` the repeated values, or
-            `mask` them, so that only the first of each run of equal values counts as measured (of
-            a run longer than usual, every row at which the sensor's own rate would have it).
-        unwrap: whether jumps by a full turn are taken out of channels that are angles.
-        angles: more channels that are angles, in radians, or in degrees where their unit is `deg`.
-        quaternions: `continuous` (q and -q are one rotation: the sign that is nearer to the row
-            before; length 1; one of length 0 is missing) or `keep` them as they are.
-        infinite: an infinite cell counts as `missing`, or `refuse` the file.
-        start: times count from the `first_row` of each episode, or are those of the recording's
-            own `clock`.
-        resample_hz: rows at this rate instead of at the stamps; each row holds what was measured
-            last since the row before it, and NaN where nothing was. None leaves the stamps alone.
-
-    Raises:
-        InputError: a value is none of these.
-    """
-
-    order: Literal["sort", "drop", "refuse"] = "sort"
-    duplicates: Literal["last", "first", "mean", "refuse"] = "last"
-    clock_jumps: Literal["split", "join", "refuse"] = "split"
-    max_gap_s: float | Literal["auto"] | None = "auto"
-    min_rows: int = 2
-    held: Literal["keep", "mask"] = "keep"
-    unwrap: bool = True
-    angles: tuple[str, ...] = ()
-    quaternions: Literal["continuous", "keep"] = "continuous"
-    infinite: Literal["missing", "refuse"] = "missing"
-    start: Literal["first_row", "clock"] = "first_row"
-    resample_hz: float | None = None
-
-    def __post_init__(self) -> None:
-        for field, choices in _CHOICES.items():
-            one_of(field, getattr(self, field), choices)
-        gap, rate = self.max_gap_s, self.resample_hz
-        if gap not in ("auto", None) and not (_is_number(gap) and gap > 0):  # type: ignore[operator]
-            raise InputError(
-                f"max_gap_s must be seconds above 0, 'auto', or None to never split, got {gap!r}"
-            )
-        if rate is not None and not (_is_number(rate) and 0 < rate <= 1e9):
-            raise InputError(
-                f"resample_hz must be above 0 and at most 1e9, or None to leave the rows where "
-                f"they are, got {rate!r}"
-            )
-        if isinstance(self.angles, str) or not all(isinstance(a, str) for a in self.angles):
-            raise InputError(f"angles must be names of channels, got {self.angles!r}")
-        if not isinstance(self.unwrap, bool):
-            raise InputError(f"unwrap must be True or False, got {self.unwrap!r}")
-        if isinstance(self.min_rows, bool) or not isinstance(self.min_rows, int):
-            raise InputError(f"min_rows must be an integer, got {self.min_rows!r}")
-        if self.min_rows < 1:
-            raise InputError(f"min_rows must be at least 1, got {self.min_rows}")
-        object.__setattr__(self, "angles", tuple(self.angles))
-
-
-_CHOICES: Mapping[str, tuple[str, ...]] = {
-    "order": ("sort", "drop", "refuse"),
-    "duplicates": ("last", "first", "mean", "refuse"),
-    "clock_jumps": ("split", "join", "refuse"),
-    "held": ("keep", "mask"),
-    "quaternions": ("continuous", "keep"),
-    "infinite": ("missing", "refuse"),
-    "start": ("first_row", "clock"),
-}
-
-
-def _is_number(value: Any) -> bool:
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )
-
-
-def assemble(recordings: Iterable[Recording], policies: Policies = Policies()) -> Dataset:  # noqa: B008  # frozen
+def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> Dataset:
     """Makes a data set of recordings: merges their signals and applies the policies.
 
+    In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
+    outages; held values, angles and quaternions per episode; resampling. Whether a channel is held
+    is found over all recordings together.
+
+    Memory: the arrays of a recording with one signal and no fault become those of its trajectory;
+    else there is, beside the result, one copy of the recordings at most.
+
     Args:
-        recordings: at least one, with a row each; all are read before anything is returned.
+        recordings: at least one, with a row; all are read before anything is returned.
         policies: what to do about faults.
 
     Returns:
@@ -217,4 +51,92 @@ def assemble(recordings: Iterable[Recording], policies: Policies = Policies()) -
         FileFormatError: a policy refuses, or nothing is left.
         InputError: `angles` names a channel that there is not.
     """
-    raise NotImplementedError
+    waiting: list[Recording | None] = list(recordings)
+    given = [recording for recording in waiting if recording is not None]
+    channels = Channels.of(given, policies)
+    unit = _common([recording.time_unit for recording in given], "ns")
+    labelled = any(recording.label for recording in given)
+    del given
+    account = Account(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
+    episodes: list[Episode] = []
+    for i, recording in enumerate(waiting):
+        assert recording is not None
+        waiting[i] = None  # its arrays go as soon as they are merged
+        account.notes |= dict.fromkeys(recording.notes)
+        episodes += cut(recording, channels, policies, account)
+    if not episodes:
+        raise FileFormatError(
+            "there is no row to read: every recording is empty, or was left out as too short "
+            f"(min_rows {policies.min_rows}); check the file, or give a smaller min_rows"
+        )
+    _mask_held(episodes, channels, policies, account)
+    if policies.unwrap or policies.quaternions == "continuous":
+        for episode in episodes:
+            _mend(episode, channels, policies, account)
+    if policies.resample_hz is not None:
+        for episode in episodes:
+            _resample(episode, policies.resample_hz)
+    trajectories = tuple(episode.trajectory(channels, policies) for episode in episodes)
+    meta: dict[str, Any] = {"time_unit": unit}
+    if labelled:
+        meta["labels"] = [episode.label for episode in episodes]
+    starts = [_clock(episode, unit) for episode in episodes]
+    if policies.start == "first_row" and any(starts):
+        meta["clock_start"] = starts
+    return Dataset(trajectories, {**meta, "report": account.report(policies)})
+
+
+def _mask_held(
+    episodes: list[Episode], channels: Channels, policies: Policies, account: Account
+) -> None:
+    for c, name in enumerate(channels.names):
+        held = mend.find_held([episode.values[:, c] for episode in episodes])
+        if held is None:
+            continue
+        account.held[name] = {"share": held.share, "rows_per_value": held.rows_per_value}
+        if policies.held == "mask":
+            for episode in episodes:
+                column = episode.own()[:, c]
+                repeats = ~mend.measured_anew(column, held.rows_per_value) & ~np.isnan(column)
+                column[repeats] = np.nan
+                account.masked += int(repeats.sum())
+
+
+def _mend(episode: Episode, channels: Channels, policies: Policies, account: Account) -> None:
+    if policies.unwrap:
+        for c, period in channels.angles.items():
+            turns = mend.unwrap(episode.own()[:, c], period)
+            if turns:
+                account.turns[channels.names[c]] += turns
+    for four in channels.quaternions:
+        part = episode.own()[:, list(four)]
+        mended = mend.mend_quaternion(part)
+        episode.values[:, list(four)] = part
+        account.flipped += mended.flipped
+        account.renormalised += mended.renormalised
+        account.dropped += mended.dropped
+
+
+def _resample(episode: Episode, rate_hz: float) -> None:
+    """Rows at a fixed rate from the first stamp on, each with what was measured since the last."""
+    since = episode.stamps - episode.stamps[0]
+    rows = int(np.ceil(since[-1] * rate_hz / 1e9 - 1e-6)) + 1
+    grid = np.rint(np.arange(rows) * (1e9 / rate_hz)).astype(np.int64)
+    row = np.searchsorted(grid, since)  # the first row of the grid that is not before it
+    row = np.minimum(row, rows - 1)
+    starts = np.flatnonzero(np.diff(row, prepend=-1))
+    values = np.full((rows, episode.values.shape[1]), np.nan, order="F")
+    values[row[starts]] = faults.merge_rows(episode.values, starts, "last")
+    episode.stamps, episode.values, episode.owned = grid + episode.stamps[0], values, True
+
+
+def _clock(episode: Episode, unit: str) -> int | float:
+    """What the recording's clock showed at the first row, in `unit`."""
+    own = NANOSECONDS_PER[episode.recording.time_unit]
+    factor = NANOSECONDS_PER[unit]
+    nanoseconds = int(episode.stamps[0]) + episode.recording.clock_zero * own
+    return nanoseconds // factor if nanoseconds % factor == 0 else nanoseconds / factor
+
+
+def _common(values: list[str], otherwise: str) -> str:
+    return values[0] if len(set(values)) == 1 else otherwise

@@ -144,8 +144,8 @@ def reader_of(path: Path) -> Reader:
     if suffix == FOLDER:
         known = ", ".join(reader.name for reader in fitting) or "none"
         raise FileFormatError(
-            f"{path} is a folder of no known format, expected one of: {known}; name the file inside "
-            "it, or its format with format="
+            f"{path} is a folder of no known format, expected one of: {known}; name the file "
+            "inside it, or its format with format="
         )
     if not fitting:
         named = (
