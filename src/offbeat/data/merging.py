@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -128,12 +128,24 @@ class Episode:
             return Trajectory(
                 (self.stamps - zero) / 1e9,
                 self.values,
+                actions=_held_actions(self.recording.actions, self.stamps),
                 names=channels.names,
                 units=channels.units,
                 origin=origin,
             )
         except InputError as error:
             raise FileFormatError(str(error)) from None
+
+
+def _held_actions(actions: Signal | None, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """(rows, actions) the action that held at each stamp: the last one up to it, or the first."""
+    if actions is None:
+        return None
+    if np.array_equal(actions.stamps, stamps):
+        return actions.values
+    order = np.argsort(actions.stamps, kind="stable")
+    held = np.searchsorted(actions.stamps[order], stamps, side="right") - 1
+    return actions.values[order[np.maximum(held, 0)]]
 
 
 def cut(
@@ -145,9 +157,7 @@ def cut(
         account.empty += 1
         return []
     found: list[Episode] = []
-    bare = Recording(
-        (), recording.label, recording.origin, recording.time_unit, clock_zero=recording.clock_zero
-    )
+    bare = replace(recording, signals=(), notes=())
     for piece in _pieces(signals, recording, policies, account):
         ordered = [_ordered(signal, recording, policies, account) for signal in piece]
         columns = [[channels.columns[s.name, c] for c in s.channels] for s in piece]

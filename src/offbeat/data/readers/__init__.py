@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data import store
-from offbeat.data.readers import table
+from offbeat.data.readers import hdf5, lerobot, ros, table, ulog
 from offbeat.data.recording import Policies, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
@@ -179,3 +179,7 @@ def load_entry_points() -> None:
 
 register(Reader("offbeat", (".parquet",), store.load, store.holds_data_set, policies=False))
 register(Reader("csv", (".csv",), table.read_csv))
+register(Reader("lerobot", (FOLDER, ".parquet", ".json"), lerobot.recordings, lerobot.recognises))
+register(Reader("ros", (*ros.SUFFIXES, FOLDER), ros.recordings, ros.recognises))
+register(Reader("ulog", ulog.SUFFIXES, ulog.recordings))
+register(Reader("hdf5", (*hdf5.SUFFIXES, FOLDER), hdf5.recordings, hdf5.recognises))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.clock import state_time_unit, time_column_of, to_nanoseconds
-from offbeat.data.recording import Recording, Signal
+from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, InputError, one_of, require
 
@@ -223,10 +223,10 @@ def _episode(
     n = next(iter(rows.values()))
     if clock:
         unit, said = state_time_unit(time_unit, clock[0], clock[1], str(path))
-        stamps, _ = to_nanoseconds(clock[1], unit)
+        stamps, zero = to_nanoseconds(clock[1], unit)
         notes = (f"stamps are the observation {clock[0]!r}", *said)
     else:
-        unit = "s"
+        unit, zero = "s", 0
         stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
     if left:
         notes = (*notes, f"left out: {', '.join(left)}")
@@ -249,6 +249,7 @@ def _episode(
         origin=f"{path.name}, {label}",
         time_unit=unit,
         notes=notes,
+        clock_zero=zero,
         actions=acted,
     )
 

@@ -1,9 +1,9 @@
 """LeRobot data sets, versions 2.0, 2.1 and 3.0, by pyarrow alone: a recording per episode.
 
-The layout (huggingface.co/docs/lerobot, "LeRobotDataset v3.0"): `meta/info.json` names the features,
-the rate and the pattern of the files' names. Version 2 has a Parquet file per episode and
+The layout (huggingface.co/docs/lerobot, "LeRobotDataset v3.0"): `meta/info.json` names the
+features, the rate and the pattern of the files' names. Version 2 has a Parquet file per episode and
 `meta/episodes.jsonl`; version 3 packs episodes into files, and `meta/episodes/*/*.parquet` says
-which file and rows each one has.
+which file each one is in.
 
 LeRobot itself writes row number / fps into `timestamp`. Where a data set brings stamps of its own,
 in `timestamp` or in another column, those are taken; else the rows are on a grid, and that is said.
@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.clock import state_time_unit, time_column_of, to_nanoseconds
-from offbeat.data.recording import Recording, Signal
+from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.errors import FileFormatError, one_of
 
 WIDEST = 1024
 """Numbers per row from which on a feature is taken for a picture or a cloud, and left out."""
@@ -123,6 +123,12 @@ class _Feature:
     def is_number(self) -> bool:
         return _NUMBERS.fullmatch(self.dtype) is not None
 
+    @property
+    def is_time(self) -> bool:
+        """Whether it is named like a time, `timestamp` or `observation.time_ns`."""
+        last = self.name.rpartition(".")[2]
+        return self.is_number and self.width == 1 and time_column_of([last]) is not None
+
     def channels(self, *, alone: bool) -> list[str]:
         """A name per number; after the feature's where others are read, too."""
         if self.labels:
@@ -194,7 +200,7 @@ class _Info:
             if feature.name in _BOOKKEEPING or feature.name.startswith(_BESIDE):
                 continue
             if feature.is_number and feature.width <= WIDEST and len(feature.shape) < 3:
-                if not time_column_of([feature.name.rpartition(".")[2]]):
+                if not feature.is_time:
                     chosen.append(feature)
             else:
                 left.append(f"{feature.name} ({feature.dtype})")
@@ -323,12 +329,8 @@ class _Reading:
             one_of("time_column", time_column, info.features)
             self.clocks = [time_column]
         else:  # stamps of their own come before LeRobot's
-            named = [
-                n for n in info.features if n not in (*_BOOKKEEPING,) and not _is_video(info, n)
-            ]
-            named = [n for n in named if time_column_of([n.rpartition(".")[2]])]
-            named = [n for n in named if info.features[n].width == 1 and info.features[n].is_number]
-            self.clocks = [*named, *(["timestamp"] if "timestamp" in info.features else [])]
+            named = [f.name for f in info.features.values() if f.is_time]
+            self.clocks = sorted(named, key=lambda name: name == "timestamp")
         self.path: Path | None = None
         self.table: Any = None
 
@@ -350,7 +352,7 @@ class _Reading:
         episode = self.table.slice(int(rows[0]), int(rows[-1] - rows[0]) + 1)
         if episode.num_rows != len(rows):
             raise FileFormatError(f"{at.file}: the rows of episode {number} do not stand together")
-        stamps, unit, said = self._stamps(episode, at.file)
+        stamps, zero, unit, said = self._stamps(episode, at.file)
         alone = len(self.chosen) == 1
         names = [name for f in self.chosen for name in f.channels(alone=alone)]
         signal = Signal("", stamps, _matrix(episode, self.chosen, at.file), tuple(names))
@@ -368,41 +370,30 @@ class _Reading:
             origin=f"{self.info.root.name}, episode {number}",
             time_unit=unit,
             notes=(*said, *self.notes),
+            clock_zero=zero,
             actions=actions,
         )
 
-    def _stamps(self, episode: Any, file: Path) -> tuple[NDArray[np.int64], str, tuple[str, ...]]:
-        """Nanoseconds, the unit of the column, and what is to be said."""
+    def _stamps(
+        self, episode: Any, file: Path
+    ) -> tuple[NDArray[np.int64], int, str, tuple[str, ...]]:
+        """Nanoseconds, the clock at nanosecond 0, the column's unit, and what is to be said."""
         fps = self.info.fps
-        n = episode.num_rows
+        grid = np.rint(np.arange(episode.num_rows) * (1e9 / fps)).astype(np.int64)
         for name in self.clocks:
             clock = _raw(episode, name, file)
-            if self.given is None and _on_grid(clock, fps):
-                continue
-            if name == "timestamp":
-                unit, said = "s", ()
-                if self.time_unit is not None:
-                    unit, said = state_time_unit(self.time_unit, name, clock, str(file))
-            else:
+            unit, said = "s", ()
+            if name != "timestamp" or self.time_unit is not None:
                 unit, said = state_time_unit(
                     self.time_unit, name.rpartition(".")[2], clock, str(file)
                 )
-            stamps, _ = to_nanoseconds(clock, unit)
-            return stamps, unit, (f"stamps are the column {name!r}", *said)
-        stamps = np.rint(np.arange(n) * (1e9 / fps)).astype(np.int64)
-        return stamps, "s", (f"stamps are row number / {fps:g} fps, no times were recorded",)
-
-
-def _is_video(info: _Info, name: str) -> bool:
-    return info.features[name].dtype in ("video", "image")
-
-
-def _on_grid(clock: NDArray[Any], fps: float) -> bool:
-    """Whether a clock is mere row number / fps, to what float32 holds."""
-    seconds = clock.astype(np.float64)
-    seconds = seconds - seconds[0] if len(seconds) else seconds
-    grid = np.arange(len(clock)) / fps
-    return bool(np.allclose(seconds, grid, rtol=1e-6, atol=1e-6))
+            stamps, zero = to_nanoseconds(clock, unit)
+            # LeRobot's own are float32: within a microsecond, or a millionth of them, is the grid.
+            near = 1_000 + grid // 1_000_000
+            if self.given is None and (np.abs(stamps - stamps[:1] - grid) <= near).all():
+                continue
+            return stamps, zero, unit, (f"stamps are the column {name!r}", *said)
+        return grid, 0, "s", (f"stamps are row number / {fps:g} fps, no times were recorded",)
 
 
 def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.readers.ros_files import Bag, Connection, explained, open_bag
 from offbeat.data.readers.ros_layout import Column, Definitions, Layout, find_layout
-from offbeat.data.recording import Recording, Signal
+from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of, require
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.recording import Recording, Signal
+from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of, require
 
