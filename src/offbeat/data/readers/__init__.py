@@ -179,7 +179,7 @@ def load_entry_points() -> None:
 
 register(Reader("offbeat", (".parquet",), store.load, store.holds_data_set, policies=False))
 register(Reader("csv", (".csv",), table.read_csv))
-register(Reader("lerobot", (FOLDER, ".parquet", ".json"), lerobot.recordings, lerobot.recognises))
+register(Reader("lerobot", (".parquet", ".json", FOLDER), lerobot.recordings, lerobot.recognises))
 register(Reader("ros", (*ros.SUFFIXES, FOLDER), ros.recordings, ros.recognises))
 register(Reader("ulog", ulog.SUFFIXES, ulog.recordings))
 register(Reader("hdf5", (*hdf5.SUFFIXES, FOLDER), hdf5.recordings, hdf5.recognises))

@@ -100,6 +100,8 @@ def _open_ros2(path: Path) -> Iterator[Bag]:
 
     forms = {MessageDefinitionFormat.MSG: "msg", MessageDefinitionFormat.IDL: "idl"}
     with explained(path):
+        for file in [path] if path.is_file() else path.glob("*.db3"):
+            _check_length(file)
         reader = Reader(path)
         try:
             reader.open()
@@ -133,6 +135,20 @@ def _open_ros2(path: Path) -> Iterator[Bag]:
         )
     finally:
         reader.close()
+
+
+def _check_length(path: Path) -> None:
+    """Raises for an SQLite file that lost its end; SQLite says so only where it looks for it."""
+    with path.open("rb") as file:
+        start = file.read(100)  # the header: sqlite.org/fileformat.html, section 1.3
+    if len(start) < 100 or not start.startswith(b"SQLite format 3"):
+        return
+    page = int.from_bytes(start[16:18], "big")
+    pages = int.from_bytes(start[28:32], "big")
+    valid = start[24:28] == start[92:96]
+    size = path.stat().st_size
+    if valid and size < pages * (65536 if page == 1 else page):
+        raise ValueError(f"it has {size} of {pages * page} bytes")
 
 
 @contextmanager
