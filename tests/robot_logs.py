@@ -143,7 +143,10 @@ def ulog_bytes(formats, rows, *, start_us=1_000, dropouts=()):
     for topic, text in formats.items():
         out.append(_ulog_message("F", f"{topic}:{text}".encode()))
         code = ""
-        for field in text.rstrip(";").split(";"):
+        fields = text.rstrip(";").split(";")
+        if fields[-1].split()[1].startswith("_padding"):
+            fields.pop()  # at the end of a message it is not logged
+        for field in fields:
             base, _, count = field.split()[0].partition("[")
             code += (count.rstrip("]") or "1") + _ULOG_CODES[base]
         packers[topic] = struct.Struct("<" + code)

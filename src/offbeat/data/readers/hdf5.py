@@ -202,7 +202,7 @@ def _episode(
         _refuse_objects(dataset, path)
         width = int(np.prod(dataset.shape[1:]))
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
-            left.append(f"{name} ({dataset.dtype})")
+            left.append(f"{name} ({_what(dataset)})")
         elif not chosen and (width > WIDEST or dataset.ndim > 3):
             left.append(f"{name} ({' x '.join(map(str, dataset.shape[1:]))})")
         elif width == 1 and time_column_of([name]):
@@ -273,17 +273,26 @@ def _prefixes(path: str) -> Iterator[str]:
 
 
 def _refuse_objects(dataset: Any, path: Path) -> None:
-    """Raises for arrays that would have to be unpickled, or that could hold anything."""
+    """Raises for what would have to be unpickled: opaque bytes, and objects of PyTables."""
+    kind = dataset.dtype
+    if (kind.kind == "V" and kind.names is None) or "PSEUDOATOM" in dataset.attrs:
+        raise FileFormatError(
+            f"{path}: {dataset.name} holds objects ({kind}), which would have to be unpickled, and "
+            "that can run any code; Offbeat never does; write numbers, or choose others with keys="
+        )
+
+
+def _what(dataset: Any) -> str:
+    """In a word, what an array holds that is none of numbers."""
     import h5py
 
-    kind = dataset.dtype.kind
-    text = h5py.check_string_dtype(dataset.dtype) is not None
-    if (kind in "OV" and not text) or "PSEUDOATOM" in dataset.attrs:
-        raise FileFormatError(
-            f"{path}: {dataset.name} holds objects ({dataset.dtype}), which would have to be "
-            "unpickled, and that can run any code; Offbeat never does; write numbers, or choose "
-            "others with keys="
-        )
+    if dataset.dtype.kind in "SU" or h5py.check_string_dtype(dataset.dtype) is not None:
+        return "text"
+    if dataset.dtype.names is not None:
+        return "records"
+    if h5py.check_vlen_dtype(dataset.dtype) is not None:
+        return "lists"
+    return str(dataset.dtype) if dataset.ndim else "one number"
 
 
 def _names(name: str, width: int) -> list[str]:
@@ -307,7 +316,7 @@ def _actions(
     for name, dataset in _leaves(episode["actions"], ""):
         _refuse_objects(dataset, path)
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
-            return None, (f"actions are left out, they hold {dataset.dtype}",)
+            return None, (f"actions are left out, they hold {_what(dataset)}",)
         values = np.asarray(dataset[()], dtype=np.float64)
         parts.append(values.reshape(len(values), -1))
         start = f"action.{name}" if name else "action"

@@ -186,7 +186,9 @@ class _Info:
                 "LeRobot"
             )
         if not fps > 0 or not features:
-            raise FileFormatError(f"{path} says {fps} fps and {len(features)} features")
+            raise FileFormatError(
+                f"{path} says {fps:g} fps and {len(features)} features, expected some"
+            )
         return cls(root, version, fps, features, data_path, total, chunk)
 
     def chosen(self, columns: Sequence[str] | None) -> tuple[list[_Feature], list[str]]:
