@@ -41,7 +41,7 @@ def disorder(stamps: Stamps) -> Disorder:
 
 
 def clock_jumps(stamps: Stamps) -> Stamps:
-    """Rows at which the clock was set: back for good, or forth by more than a day.
+    """Rows at which the clock was set: back for good, or forth by more than a day (and 20 steps).
 
     A step back counts if it is longer than a second and than 20 median steps, and if none of the
     10 rows that follow reaches the old clock again; else the row is late, and not the clock wrong.
@@ -59,10 +59,11 @@ def clock_jumps(stamps: Stamps) -> Stamps:
     stays = (stamps[after] < stamps[back - 1][:, None]).all(axis=1)
     # At the very end there is nothing after it to tell by.
     back = back[stays & (back < len(stamps) - 1)]
-    forth = np.flatnonzero(steps > _DAY) + 1
+    far = max(_DAY, 20 * usual)
+    forth = np.flatnonzero(steps > far) + 1
     # A forward step that merely ends a late stamp is none.
     reached = np.maximum.accumulate(stamps)
-    forth = forth[stamps[forth] - reached[forth - 1] > _DAY]
+    forth = forth[stamps[forth] - reached[forth - 1] > far]
     return np.union1d(back, forth)
 
 

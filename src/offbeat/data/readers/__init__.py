@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data import store
-from offbeat.data.readers import hdf5, lerobot, ros, table, ulog
+from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, ulog
 from offbeat.data.recording import Policies, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
@@ -108,16 +108,13 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
     path = require_source(path)
     load_entry_points()
     reader = reader_of(path) if format is None else READERS[one_of("format", format, READERS)]
-    known = [*reader.options, *(POLICIES if reader.policies else ())]
+    own = reader.options
+    known = [*own, *(POLICIES if reader.policies else ())]
     for option in options:
         if not known:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
         one_of(f"option of the {reader.name} reader", option, known)
-    policies = {
-        name: options.pop(name)
-        for name in POLICIES
-        if name not in reader.options and name in options
-    }
+    policies = {name: options.pop(name) for name in list(options) if name not in own}
     made = reader.function(path, **options)
     if isinstance(made, Dataset):
         if policies:
@@ -178,7 +175,11 @@ def load_entry_points() -> None:
 
 
 register(Reader("offbeat", (".parquet",), store.load, store.holds_data_set, policies=False))
-register(Reader("csv", (".csv",), table.read_csv))
+register(Reader("parquet", (".parquet", ".pq"), parquet.read_parquet))
+register(Reader("euroc", (".csv", FOLDER), pose.read_euroc, pose.is_euroc))
+register(Reader("tum", (".tum", ".txt"), pose.read_tum, pose.is_tum))
+register(Reader("csv", (".csv", ".tsv", ".txt"), table.read_csv))
+register(Reader("npz", (".npz",), npz.read_npz))
 register(Reader("lerobot", (".parquet", ".json", FOLDER), lerobot.recordings, lerobot.recognises))
 register(Reader("ros", (*ros.SUFFIXES, FOLDER), ros.recordings, ros.recognises))
 register(Reader("ulog", ulog.SUFFIXES, ulog.recordings))
