@@ -296,3 +296,52 @@ def write_lerobot(folder, episodes, *, version="v2.1", features=FEATURES, fps=20
         for i, episode in enumerate(episodes):
             pq.write_table(_table([episode]), folder / f"data/chunk-000/episode_{i:06d}.parquet")
     return folder
+
+
+def _joints(store, stamps, values):
+    received = int(min(stamps)) + 10**6 * np.arange(len(stamps))  # in the order of the log
+    return [
+        ("/joints", int(r), joint_message(store, t, ["hip", "knee"], row))
+        for r, t, row in zip(received, stamps, values, strict=True)
+    ]
+
+
+def _write_own_clock(path, stamps, values, version):
+    episode = lerobot_episode(0, len(stamps)) | {
+        "observation.state": values,
+        "observation.time_ns": stamps,
+    }
+    features = FEATURES | {
+        "observation.state": {"dtype": "float64", "shape": [2], "names": ["hip", "knee"]},
+        "observation.time_ns": {"dtype": "int64", "shape": [1], "names": None},
+    }
+    return write_lerobot(path, [episode], version=version, features=features)
+
+
+def _write_ulog(path, stamps, values):
+    formats = {"joints": "uint64_t timestamp;double hip;double knee;"}
+    rows = [("joints", 0, (int(t) // 1000, *row)) for t, row in zip(stamps, values, strict=True)]
+    path = path.with_suffix(".ulg")
+    path.write_bytes(ulog_bytes(formats, rows, start_us=int(stamps[0]) // 1000))
+    return path
+
+
+SAME_WALK = {
+    "ros bag": lambda path, t, x: write_bag1(path.with_suffix(".bag"), _joints(ROS1, t, x)),
+    "ros db3": lambda path, t, x: write_bag2(path, _joints(ROS2, t, x)),
+    "ros mcap": lambda path, t, x: write_bag2(path, _joints(ROS2, t, x), mcap=True),
+    "ulog": _write_ulog,
+    "lerobot v2.1": lambda path, t, x: _write_own_clock(path, t, x, "v2.1"),
+    "lerobot v3.0": lambda path, t, x: _write_own_clock(path, t, x, "v3.0"),
+    "hdf5 robomimic": lambda path, t, x: write_robomimic(
+        path.with_suffix(".hdf5"),
+        [{"actions": np.zeros((len(t), 1)), "joints": x, "time_ns": t}],
+    ),
+    "hdf5 minari": lambda path, t, x: write_minari(
+        path, [({"joints": x, "time_ns": t}, np.zeros((len(t) - 1, 1)))]
+    ),
+}
+"""Per format, what writes stamps (n,), nanoseconds in whole microseconds, and values (n, 2)."""
+
+SAME_WALK_OPTIONS = {"ulog": {"topics": ["joints"]}}
+"""Options that a format needs to read it."""
