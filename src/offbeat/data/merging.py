@@ -145,12 +145,24 @@ class Episode:
             return Trajectory(
                 (self.stamps - zero) / 1e9,
                 self.values,
+                actions=_held_actions(self.recording.actions, self.stamps),
                 names=channels.names,
                 units=channels.units,
                 origin=origin,
             )
         except InputError as error:
             raise FileFormatError(str(error)) from None
+
+
+def _held_actions(actions: Signal | None, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """(rows, actions) the action that held at each stamp: the last one up to it, or the first."""
+    if actions is None:
+        return None
+    if np.array_equal(actions.stamps, stamps):
+        return actions.values
+    order = np.argsort(actions.stamps, kind="stable")
+    held = np.searchsorted(actions.stamps[order], stamps, side="right") - 1
+    return actions.values[order[np.maximum(held, 0)]]
 
 
 def cut(

@@ -43,7 +43,8 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
 
     Returns:
         A trajectory per recording, or several where it was split. `meta` holds `time_unit`, the
-        `report` of what each policy did, `labels` (where recordings have them) and `clock_start`
+        `report` of what each policy did, `actions` (their names, where there are any), `labels`
+        (where recordings have them) and `clock_start`
         (what the recording's clock showed at time 0, in `time_unit`, where that was not 0), each
         with an entry per trajectory.
 
@@ -55,6 +56,7 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
     given = [recording for recording in waiting if recording is not None]
     channels = Channels.of(given, policies)
     unit = _common([recording.time_unit for recording in given], "ns")
+    actions = next((r.actions.channels for r in given if r.actions is not None), None)
     labelled = any(recording.label for recording in given)
     del given
     account = Account(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
@@ -80,6 +82,8 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
     meta: dict[str, Any] = {"time_unit": unit}
     if labelled:
         meta["labels"] = [episode.label for episode in episodes]
+    if actions is not None:
+        meta["actions"] = list(actions)
     starts = [_clock(episode, unit) for episode in episodes]
     if policies.start == "first_row" and any(starts):
         meta["clock_start"] = starts

@@ -88,9 +88,11 @@ class Recording:
             fps".
         clock_zero: what the file's clock shows at stamp 0, in `time_unit`, where the stamps do not
             count from the clock's own zero because that would exceed an int64.
+        actions: what was commanded, on the same clock, in the order of time. A row of a trajectory
+            has the action that held then: the last one up to its stamp, or the first one.
 
     Raises:
-        InputError: the unit is unknown.
+        InputError: the unit is unknown, or there are no actions in `actions`.
     """
 
     signals: tuple[Signal, ...]
@@ -99,8 +101,11 @@ class Recording:
     time_unit: str = "ns"
     notes: tuple[str, ...] = ()
     clock_zero: int = 0
+    actions: Signal | None = None
 
     def __post_init__(self) -> None:
         one_of("time unit", self.time_unit, NANOSECONDS_PER)
+        if self.actions is not None and not self.actions.values.size:
+            raise InputError("actions must hold a row at least, got none; leave them out")
         object.__setattr__(self, "signals", tuple(self.signals))
         object.__setattr__(self, "notes", tuple(self.notes))

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data import store
-from offbeat.data.readers import npz, parquet, pose, table
+from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, ulog
 from offbeat.data.recording import Policies, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
@@ -188,3 +188,7 @@ register(Reader("euroc", (".csv", FOLDER), pose.read_euroc, pose.is_euroc))
 register(Reader("tum", (".tum", ".txt"), pose.read_tum, pose.is_tum))
 register(Reader("csv", (".csv", ".tsv", ".txt"), table.read_csv))
 register(Reader("npz", (".npz",), npz.read_npz))
+register(Reader("lerobot", (".parquet", ".json", FOLDER), lerobot.recordings, lerobot.recognises))
+register(Reader("ros", (*ros.SUFFIXES, FOLDER), ros.recordings, ros.recognises))
+register(Reader("ulog", ulog.SUFFIXES, ulog.recordings))
+register(Reader("hdf5", (*hdf5.SUFFIXES, FOLDER), hdf5.recordings, hdf5.recognises))
