@@ -16,6 +16,7 @@ from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
 from offbeat.commands.predict import predict_command
+from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
 from offbeat.commands.train import train_command
 from offbeat.errors import OffbeatError
@@ -42,6 +43,7 @@ COMMANDS: dict[str, Any] = {
     "predict": predict_command,
     "compare": compare_command,
     "demo": demo_command,
+    "reproduce": reproduce_command,
     "doctor": doctor_command,
 }
 
@@ -59,7 +61,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     # A flag, although options made from bool arguments want a value.
-    arguments = ["--json=true" if argument == "--json" else argument for argument in arguments]
+    arguments = [
+        f"{argument}=true" if argument in ("--json", "--tiny") else argument
+        for argument in arguments
+    ]
     if arguments == ["--version"]:
         from offbeat import __version__
 
