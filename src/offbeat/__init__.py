@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
     from offbeat.report.comparison import Comparison, compare, read_runs
+    from offbeat.report.reproduction import write_report
     from offbeat.scores import Score, Scores, row_0_constant
     from offbeat.training import FitResult, fit
 
@@ -66,6 +67,7 @@ _HOMES = {
     "thin": "data.thin",
     "train_config": "models.zoo",
     "windows": "data.prepare",
+    "write_report": "report.reproduction",
 }
 
 __all__ = [
@@ -109,6 +111,7 @@ __all__ = [
     "thin",
     "train_config",
     "windows",
+    "write_report",
 ]
 
 

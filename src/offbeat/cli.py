@@ -16,6 +16,7 @@ from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
 from offbeat.commands.predict import predict_command
+from offbeat.commands.report import report_command
 from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
 from offbeat.commands.train import train_command
@@ -44,6 +45,7 @@ COMMANDS: dict[str, Any] = {
     "compare": compare_command,
     "demo": demo_command,
     "reproduce": reproduce_command,
+    "report": report_command,
     "doctor": doctor_command,
 }
 
