@@ -46,7 +46,7 @@ def illustrate(
     window: int = 100,
     state_seed: int = 123,
     fresh_seed: int = 1,
-    trajectories: int = 150,
+    trajectories: int = 100,
     every: int = 5,
     progress: bool = False,
 ) -> Illustrations:
@@ -93,7 +93,7 @@ def illustrate(
     kept = replace(
         kept,
         fraction=observed_fraction,
-        runs={label: _run_of(Path(path)) for label, path in checkpoints.items()},
+        runs=runs_of(checkpoints),
         trace=Trace(
             first.times - first.times[0],
             np.asarray(first.observed.any(axis=1)),
@@ -131,6 +131,15 @@ def checkpoints_of(runs: str | Path, observed_fraction: float) -> dict[str, Path
                 if (folder / "model" / CONFIG).is_file() or (folder / CONFIG).is_file():
                     found.setdefault(label, folder)
     return found
+
+
+def runs_of(checkpoints: Mapping[str, str | Path]) -> dict[str, str]:
+    """Names of the runs whose checkpoints these are, by label."""
+    folders = {label: Path(path) for label, path in checkpoints.items()}
+    return {
+        label: folder.parent.name if folder.name == "training" else folder.name
+        for label, folder in folders.items()
+    }
 
 
 def hidden_states(
@@ -180,10 +189,6 @@ def lay_out(states: NDArray[np.float64], *, seed: int = 0) -> NDArray[np.float64
         mapper = umap.UMAP(n_neighbors=15, random_state=seed, n_jobs=1)
         places: NDArray[np.float64] = mapper.fit_transform(states)
     return places
-
-
-def _run_of(folder: Path) -> str:
-    return folder.parent.name if folder.name in ("training", "model") else folder.name
 
 
 def _typical(dataset: Dataset) -> int:

@@ -174,7 +174,7 @@ def time_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, 
     if circumstances.engines:
         facts.append(("Ran by", "; ".join(circumstances.engines)))
     ended = sorted(str(t) for t in record.runs["finished_at"])
-    facts.append(("First and last run finished", f"{ended[0]} and {ended[-1]}"))
+    facts += [("First run finished", ended[0]), ("Last run finished", ended[-1])]
     return facts
 
 

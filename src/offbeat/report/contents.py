@@ -260,7 +260,9 @@ def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
         pictures.append(
             Picture(
                 "3.2",
-                f"Two channels of the first {count} trajectories of the data.",
+                f"Two channels of the first {count} trajectories of the data: {CHANNELS[0]}, the "
+                "vertical position of the torso from where the model file has it, and "
+                f"{CHANNELS[1]}, the angle of the knee.",
                 f"{count} lines over {duration:.0f} ms in two panels: height of the torso and "
                 "angle of the knee.",
                 channels_figure(shown),

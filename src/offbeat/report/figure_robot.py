@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 CHANNELS = ("rootz_qpos", "knee_qpos")
 """Channels of figure 3.2: height of the torso and angle of the knee."""
 
-_NAMES = {"rootz_qpos": "Height of the torso", "knee_qpos": "Angle of the knee"}
-
 
 def frames_figure(illustrations: Illustrations, *, trajectory: int = 0, frames: int = 8) -> Figure:
     """The simulated robot at even times along one recording; the camera follows the torso.
@@ -75,7 +73,7 @@ def channels_figure(illustrations: Illustrations, channels: Sequence[str] = CHAN
             for values, shade in zip(recordings, shades, strict=True):
                 axes.plot(illustrations.times, values, color=shade, linewidth=1.0)
             unit = illustrations.units[channel]
-            axes.set_ylabel(f"{_NAMES.get(name, name)} ({unit})" if unit else name)
+            axes.set_ylabel(f"{name} ({unit})" if unit else name)
             axes.set_xlabel("Time (s)")
             axes.margins(x=0.01)
     return figure

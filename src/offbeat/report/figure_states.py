@@ -59,9 +59,9 @@ def states_figure(trace: Trace) -> Figure:
             axes.set_visible(False)
         for axes in panels[max(0, len(models) - columns) : len(models)]:
             axes.tick_params(labelbottom=True)
-            axes.set_xlabel("Time (s)")
-        for axes in panels[::columns]:
-            axes.set_ylabel("Hidden units (1)")
+        size = RC["axes.labelsize"]
+        figure.supxlabel("Time (s)", fontsize=size)
+        figure.supylabel("Hidden units (without unit)", fontsize=size)
     return figure
 
 

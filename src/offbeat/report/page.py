@@ -67,6 +67,7 @@ tbody tr:not(.block):hover{background:var(--shade)}
 figure{margin:1.4rem 0}
 figure img{display:block;max-width:100%;height:auto}
 figcaption{font-size:.9rem;margin-top:.4rem;max-width:46rem}
+.pair img{width:100%}
 .pair{display:grid;grid-template-columns:repeat(2,minmax(0,1fr));gap:.5rem 1.6rem}
 .wide .scroll{margin:0}
 code,pre{font-family:ui-monospace,SFMono-Regular,Menlo,Consolas,monospace;font-size:.87rem}
@@ -83,7 +84,8 @@ details ul{margin:.3rem 0;padding-left:1.2rem}
 dl{display:grid;grid-template-columns:minmax(8rem,max-content) 1fr;gap:.2rem 1rem;font-size:.92rem}
 dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
 footer{margin-top:3rem;padding-bottom:3rem;color:var(--soft);font-size:.85rem}
-@media (max-width:44rem){.pair{grid-template-columns:1fr}.wide img{max-width:none;width:42rem}
+@media (max-width:44rem){th,td{padding:.2rem .45rem}table{font-size:.84rem}
+.pair{grid-template-columns:1fr}.wide img{max-width:none;width:42rem}
 tbody th[scope=row]{position:sticky;left:0;background:var(--paper)}
 dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.4rem}}
 @media print{.scroll{overflow:visible}nav{display:none}}

@@ -42,8 +42,8 @@ STYLES: dict[str, Style] = {
     "rnn": Style("RNN", "#999933", "P", _DOTTED),
     "lstm": Style("LSTM", "#332288", "X", _DOTTED),
     "neural_ode": Style("Neural ODE", "#882255", "*", _DASHED),
-    "gru_fair": Style("GRU, fair", "#AA4499", "o", _DOTTED),
-    "gru_d_fair": Style("GRU-D, fair", "#DDCC77", "s", _DASH_DOT),
+    "gru_fair": Style("Fair GRU", "#AA4499", "o", _DOTTED),
+    "gru_d_fair": Style("Fair GRU-D", "#DDCC77", "s", _DASH_DOT),
 }
 """The styles by id of the model; `truth` and `last_value` stand beside them."""
 

@@ -20,7 +20,6 @@ _DARK = {
     "#e4e4e4": "#333940",  # grid
     "#b8b8b8": "#5a626b",
     "#595959": "#b3b3b3",
-    "#0072b2": "#3d9fe0",  # too dark beside a dark page
 }
 
 
