@@ -16,13 +16,12 @@ from offbeat.errors import (
 
 if TYPE_CHECKING:
     from offbeat.data.batch import Batch, delta, last_values
-    from offbeat.data.prepare import Scaler, parts, split, split_in_time
+    from offbeat.data.prepare import Scaler, parts, split, split_in_time, windows
     from offbeat.data.readers import read
     from offbeat.data.simulate import simulate
     from offbeat.data.store import load, save
     from offbeat.data.thin import thin
     from offbeat.data.trajectory import Dataset, Trajectory
-    from offbeat.data.windows import windows
     from offbeat.evaluation import Evaluation, evaluate
     from offbeat.inference.export import export_onnx
     from offbeat.inference.extrapolate import extrapolate
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
     from offbeat.report.comparison import Comparison, compare, read_runs
+    from offbeat.report.reproduction import write_report
     from offbeat.scores import Score, Scores, row_0_constant
     from offbeat.training import FitResult, fit
 
@@ -87,7 +87,8 @@ _HOMES = {
     "thesis_config": "models.zoo",
     "thin": "data.thin",
     "train_config": "models.zoo",
-    "windows": "data.windows",
+    "windows": "data.prepare",
+    "write_report": "report.reproduction",
 }
 
 __all__ = [
@@ -144,6 +145,7 @@ __all__ = [
     "thin",
     "train_config",
     "windows",
+    "write_report",
 ]
 
 

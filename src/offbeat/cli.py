@@ -20,6 +20,7 @@ from offbeat.commands.extrapolate import extrapolate_command
 from offbeat.commands.impute import impute_command
 from offbeat.commands.inspect import inspect_command
 from offbeat.commands.predict import predict_command
+from offbeat.commands.report import report_command
 from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
 from offbeat.commands.stream import stream_command
@@ -56,6 +57,7 @@ COMMANDS: dict[str, Any] = {
     "extrapolate": extrapolate_command,
     "demo": demo_command,
     "reproduce": reproduce_command,
+    "report": report_command,
     "doctor": doctor_command,
 }
 

@@ -89,6 +89,24 @@ def side_by_side(
     return _write_gif(frames, durations, Path(path))
 
 
+def stills(robot: str, qpos: ArrayLike) -> NDArray[np.uint8]:
+    """Pictures of a robot, one per row, seen from the side; the camera follows the torso.
+
+    Args:
+        robot: one of `offbeat.data.robots.ROBOTS`.
+        qpos: (rows, nq) positions, in the order of the robot's channels.
+
+    Returns:
+        (rows, height, width, 3) red, green, blue.
+
+    Raises:
+        InputError: `qpos` is not finite or of another shape.
+        MissingExtraError: mujoco or dm_control is not installed, or no way of rendering works.
+    """
+    positions = _positions("qpos", qpos, load_model(robot).nq)
+    return _render_somehow(robot, positions, positions)[:, 0]
+
+
 def render_frames(request: str, answer: str) -> None:
     """Renders what `request` asks for; runs in a process whose `MUJOCO_GL` is set.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -46,10 +47,12 @@ STYLES: dict[str, Style] = {
     "rnn": Style("RNN", "#999933", "P", _DOTTED),
     "lstm": Style("LSTM", "#332288", "X", _DOTTED),
     "neural_ode": Style("Neural ODE", "#882255", "*", _DASHED),
+    "gru_fair": Style("Fair GRU", "#AA4499", "o", _DOTTED),
+    "gru_d_fair": Style("Fair GRU-D", "#DDCC77", "s", _DASH_DOT),
 }
 """The styles by id of the model; `truth` and `last_value` stand beside them."""
 
-_OTHERS = ("#44AA99", "#AA4499", "#117733", "#661100", "#6699CC")
+_OTHERS = ("#44AA99", "#CC6677", "#117733", "#661100", "#6699CC")
 
 
 def style_of(name: str) -> Style:
@@ -59,7 +62,19 @@ def style_of(name: str) -> Style:
     return Style(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)], "o")
 
 
+COLUMN_WIDTH = 3.5
+PAGE_WIDTH = 7.0
+"""Widths of figures, one and two columns of a journal, inches."""
+
+INK = "#1A1A1A"
+"""Of text and axes."""
+
 RC: dict[Any, Any] = {
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
     "font.size": 9,
     "axes.labelsize": 9,
@@ -84,3 +99,19 @@ RC: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 """Settings of matplotlib, in force only while a figure is made or saved."""
+
+
+def plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
+    """A few labels on a logarithmic axis, in plain numbers, also within one decade.
+
+    Args:
+        axis: of matplotlib.
+        limits: between which it is seen.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    decades = math.log10(limits[1] / limits[0])
+    steps = (1.0,) if decades > 2.5 else (1.0, 2.0, 5.0) if decades > 0.7 else (1, 1.5, 2, 3, 5, 7)
+    axis.set_major_locator(LogLocator(subs=steps))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.7f}".rstrip("0")))
+    axis.set_minor_formatter(NullFormatter())

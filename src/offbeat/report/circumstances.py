@@ -1,0 +1,203 @@
+"""How a record came about: its protocol, time and machine, and where its runs differ in these."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offbeat.report import thesis_numbers as thesis
+from offbeat.report.records import PROVENANCE, Record
+from offbeat.report.tables import label, percent
+
+_NAMES = {
+    "commit": "commit",
+    "code": "code (hash of the source that numbers depend on)",
+    "cpu": "processor",
+    "kernel_body": "kernel body",
+    "threads": "threads per run",
+    "torch": "torch",
+    "mujoco": "mujoco",
+    "data": "recorded data (hash)",
+}
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What stands beside a record in its folder.
+
+    Attributes:
+        protocol: the fields of the protocol; empty where the folder has none.
+        sittings_s: s, wall time of all sittings together; None where it was not kept.
+        engines: what ran them.
+        commands: what was typed.
+        machine: names and values of what the record itself does not hold.
+    """
+
+    protocol: Mapping[str, Any] = field(default_factory=dict)
+    sittings_s: float | None = None
+    engines: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    machine: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(cls, folder: str | Path) -> Circumstances:
+        """Reads `protocol.json` and `sittings.json`, or `about.json` of a published record.
+
+        What is missing or damaged is left out: the record stands without it.
+        """
+        folder = Path(folder)
+        about = _mapping(_json(folder / "about.json"))
+        sittings = _rows(_json(folder / "sittings.json")) or _rows(about.get("sittings"))
+        spent = [one.get("seconds") for one in sittings]
+        known = [s for s in spent if isinstance(s, int | float)]
+        typed = about.get("commands")
+        here = _mapping(about.get("here"))
+        machine: list[tuple[str, str]] = [
+            (name, str(here[name])) for name in ("platform", "cores", "python") if name in here
+        ]
+        machine += [(k, str(v)) for k, v in _mapping(here.get("packages")).items()]
+        return cls(
+            _mapping(_json(folder / "protocol.json")) or _mapping(about.get("protocol")),
+            float(sum(known)) if known and len(known) == len(spent) else None,
+            tuple(dict.fromkeys(str(one["engine"]) for one in sittings if "engine" in one)),
+            tuple(" ".join(map(str, c)) for c in typed if isinstance(c, list))
+            if isinstance(typed, list)
+            else (),
+            tuple(machine),
+        )
+
+    @property
+    def repeats(self) -> int:
+        """Of experiment 2 in the full protocol."""
+        said = self.protocol.get("repeats")
+        return said if isinstance(said, int) and said >= 1 else thesis.REPEATS
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _rows(value: Any) -> list[dict[str, Any]]:
+    return [one for one in value if isinstance(one, dict)] if isinstance(value, list) else []
+
+
+def expected_runs(repeats: int, models: int, thesis_models: int) -> int:
+    """Runs of the full protocol: experiment 1 and the repeats of experiment 2."""
+    return len(thesis.FRACTIONS) * (thesis_models + models * repeats)
+
+
+def wall_hours(record: Record) -> float | None:
+    """Hours in which at least one run was going, pauses left out; None without times.
+
+    Each run ended at `finished_at` and took `seconds`; what overlaps counts once. A run that was
+    interrupted counts as if it had been made in one piece.
+    """
+    spans = []
+    for seconds, ended in zip(record.runs["seconds"], record.runs["finished_at"], strict=True):
+        try:
+            end = datetime.fromisoformat(str(ended)).timestamp()
+        except ValueError:
+            return None
+        spans.append((end - float(seconds), end))
+    covered, reached = 0.0, -np.inf
+    for start, end in sorted(spans):
+        covered += max(0.0, end - max(start, reached))
+        reached = max(reached, end)
+    return covered / 3600
+
+
+def mixing(record: Record) -> tuple[str, ...]:
+    """A sentence for each circumstance in which the runs of a record differ."""
+    said = []
+    for column in PROVENANCE:
+        counts = record.counts(column)
+        if len(counts) > 1:
+            parts = "; ".join(f"{value or 'not known'}: {n}" for value, n in counts.items())
+            said.append(f"The runs do not share one {_NAMES[column]}. Runs by value: {parts}.")
+    if len(record.counts("commit")) > 1 and len(record.counts("code")) == 1:
+        said.append("The commits differ in nothing that numbers depend on: the code is the same.")
+    return tuple(said)
+
+
+def broken_pairs(record: Record) -> tuple[str, ...]:
+    """A sentence for each repeat whose models did not see the same test part.
+
+    Models of a repeat share windows, masks and split, so that the last-value predictor scores the
+    same to the last bit beside each of them. Where it does not, no paired test is right.
+    """
+    said = []
+    for fraction in thesis.FRACTIONS:
+        rows = record.where(experiment=2, fraction=fraction)
+        repeats = record.values("repeat", rows)
+        for repeat in sorted(set(repeats.tolist())):
+            scores = record.values("last_value_honest_mse", rows[repeats == repeat]).astype(float)
+            if np.ptp(scores) > 1e-9 * scores.max():
+                models = ", ".join(
+                    label(str(m)) for m in record.values("model", rows[repeats == repeat])
+                )
+                said.append(
+                    f"At {percent(fraction)}, repeat {repeat}: the last value scores differently "
+                    f"beside {models}. They were not tested on the same data, so paired tests that "
+                    "contain this repeat are not valid."
+                )
+    return tuple(said)
+
+
+def time_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
+    """Time and its split, as names and values."""
+    seconds = record.runs["seconds"].astype(float)
+    facts = [("Runs", f"{len(record)}"), ("Sum of the run times", hours(seconds.sum()))]
+    for experiment in (1, 2):
+        runs = record.where(experiment=experiment)
+        if len(runs):
+            facts.append(
+                (f"Experiment {experiment}", f"{hours(seconds[runs].sum())}, {len(runs)} runs")
+            )
+    covered = wall_hours(record)
+    if covered is not None:
+        facts.append(("Wall time with at least one run going", hours(3600 * covered)))
+    if circumstances.sittings_s is not None:
+        facts.append(("Wall time of all sittings", hours(circumstances.sittings_s)))
+    if circumstances.engines:
+        facts.append(("Ran by", "; ".join(circumstances.engines)))
+    ended = sorted(str(t) for t in record.runs["finished_at"])
+    facts += [("First run finished", ended[0]), ("Last run finished", ended[-1])]
+    return facts
+
+
+def machine_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
+    """Machine and versions, as names and values, each with the number of runs where they differ.
+
+    What only the folder knows comes last; it is of the machine that published the record.
+    """
+    facts = []
+    for column, name in _NAMES.items():
+        counts = record.counts(column)
+        values = [
+            f"{value or 'not known'}" + (f" ({n} runs)" if len(counts) > 1 else "")
+            for value, n in counts.items()
+        ]
+        facts.append((name[0].upper() + name[1:], "; ".join(values)))
+    there = {name.lower() for name, _ in facts}
+    facts += [(k[0].upper() + k[1:], v) for k, v in circumstances.machine if k not in there]
+    return facts
+
+
+def hours(seconds: float) -> str:
+    """A time as people say it."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

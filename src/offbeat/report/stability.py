@@ -1,0 +1,308 @@
+"""Convergence and spread, which the thesis judges by eye, measured on every run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.errors import InputError
+from offbeat.report import findings as say
+from offbeat.report import thesis_numbers as thesis
+from offbeat.report.findings import Verdict
+from offbeat.report.pairing import MODELS, Pair, corrected, paired_rmse
+from offbeat.report.records import Record
+from offbeat.report.statistics import (
+    SpreadComparison,
+    convergence,
+    enough_epochs,
+    holm,
+    paired_comparison,
+    settling,
+    spread_comparison,
+)
+from offbeat.report.table import MIXED, Block, Cell, Table
+from offbeat.report.tables import HEADINGS, label, notes, percent, rmse_of
+
+SCORINGS = {"published": "Published scoring", "honest": "Honest scoring"}
+_COLUMNS = tuple(map(percent, thesis.FRACTIONS))
+_OURS, _OTHER = "ode_gru_d", "ode_rnn"
+TOLERANCE = 0.05
+"""A run has settled when its validation MSE stays within this of its final one."""
+
+
+# --- how fast -------------------------------------------------------------------------------------
+
+
+def curves_of(
+    record: Record, experiment: int, model: str, fraction: float, scoring: str
+) -> dict[int, NDArray[np.float64]]:
+    """Validation MSE by epoch of each run that has a whole curve, by repeat."""
+    rows = record.where(experiment=experiment, model=model, fraction=fraction)
+    found = {}
+    for name, repeat in zip(
+        record.values("run_id", rows), record.values("repeat", rows), strict=True
+    ):
+        curve = record.curve(str(name))
+        if len(curve["epoch"]) and (np.diff(curve["epoch"], prepend=0) == 1).all():
+            found[int(repeat)] = curve[f"validation_{scoring}_mse"]
+    return found
+
+
+def speed_pairs(record: Record, scoring: str) -> tuple[Pair, ...]:
+    """ODE-GRU-D against ODE-RNN, paired: epochs until a run of experiment 2 has settled."""
+    pairs = []
+    for fraction in thesis.FRACTIONS:
+        ours, other = (curves_of(record, 2, model, fraction, scoring) for model in (_OURS, _OTHER))
+        shared = sorted(ours.keys() & other.keys())
+        a, b = (
+            [settling(curves[r], tolerance=TOLERANCE).settled for r in shared]
+            for curves in (ours, other)
+        )
+        pair = Pair(_OURS, _OTHER, fraction, scoring, measure="epochs")
+        try:
+            result = paired_comparison(a, b, names=(label(_OURS), label(_OTHER)))
+            pairs.append(replace(pair, result=result))
+        except InputError as error:
+            pairs.append(replace(pair, missing=str(error)))
+    return corrected(pairs)
+
+
+def speed_verdicts(record: Record) -> dict[str, Verdict]:
+    """Does ODE-GRU-D converge in fewer epochs than ODE-RNN?"""
+    verdicts = {}
+    for scoring, shown in SCORINGS.items():
+        verdict = say.all_better(speed_pairs(record, scoring))
+        once = []
+        for fraction in thesis.FRACTIONS:
+            curves = [curves_of(record, 1, m, fraction, scoring) for m in (_OURS, _OTHER)]
+            if all(0 in mine for mine in curves):
+                ours, other = (settling(c[0], tolerance=TOLERANCE).settled for c in curves)
+                once.append(f"{percent(fraction)}: {ours} and {other}")
+        if once:
+            said = (
+                f"In experiment 1, one run each, {label(_OURS)} and {label(_OTHER)} settle at "
+                f"epoch {'; '.join(once)}."
+            )
+            verdict = Verdict(verdict.word, (*verdict.evidence, said))
+        verdicts[shown] = verdict
+    return verdicts
+
+
+def enough_verdicts(record: Record) -> dict[str, Verdict]:
+    """Do 75 and 50 epochs follow from the curves of experiment 1?"""
+    verdicts = {}
+    for scoring, shown in SCORINGS.items():
+        said, tested, right, asked = [], 0, 0, 0
+        for fraction, chosen in thesis.CHOSEN_EPOCHS.items():
+            for model in thesis.MODELS:
+                asked += 1
+                curve = curves_of(record, 1, model, fraction, scoring).get(0)
+                at = f"At {percent(fraction)}, {label(model)}"
+                if curve is None:
+                    said.append(f"{at}: there is no curve of experiment 1.")
+                    continue
+                try:
+                    found = enough_epochs([curve], chosen, tolerance=TOLERANCE)
+                except InputError as error:
+                    said.append(f"{at}: {error}.")
+                    continue
+                tested += 1
+                right += found.follows
+                said.append(
+                    f"{at}: after {chosen} epochs the error is {found.ratios[0]:.2f} times that "
+                    f"after {len(curve)}; it stays within {100 * TOLERANCE:g}\N{THIN SPACE}% from "
+                    f"epoch {found.settled[0]} on."
+                )
+        verdicts[shown] = Verdict(say.word(asked, tested, right, tested - right), tuple(said))
+    return verdicts
+
+
+def speed_table(record: Record, *, number: str) -> Table:
+    """Epochs until a run has settled, over the repeats and in experiment 1."""
+    blocks = []
+    for experiment, models in ((2, MODELS), (1, thesis.MODELS)):
+        for scoring, shown in SCORINGS.items():
+            rows = []
+            for model in models:
+                cells = [_settled(record, experiment, model, f, scoring) for f in thesis.FRACTIONS]
+                rows.append((label(model), tuple(cells)))
+            blocks.append(Block(f"Experiment {experiment}, {shown.lower()}", tuple(rows)))
+    return Table(
+        number,
+        f"Epochs until the validation MSE stays within {100 * TOLERANCE:g}\N{THIN SPACE}% of the "
+        "run's final one: mean over the repeats with a 95 % bootstrap interval, and the single run "
+        "of experiment 1.",
+        "Model",
+        _COLUMNS,
+        tuple(blocks),
+        notes(
+            record,
+            blocks,
+            "A run of experiment 2 is compared with its own end, at 75 or 50 epochs, where its "
+            "error may still be falling.",
+        ),
+    )
+
+
+def _settled(record: Record, experiment: int, model: str, fraction: float, scoring: str) -> Cell:
+    curves = list(curves_of(record, experiment, model, fraction, scoring).values())
+    if not curves:
+        return Cell(n=0)
+    mark = (
+        MIXED
+        if record.mixed(record.where(experiment=experiment, model=model, fraction=fraction))
+        else ""
+    )
+    mean = convergence(curves, tolerance=TOLERANCE).settled
+    if experiment == 1 and len(curves) == 1:
+        return Cell(f"{mean.value:.0f}", mean.value, n=1, mark=mark)
+    text = f"{mean.value:.1f}"
+    if mean.low is not None and mean.high is not None:
+        text += f" [{mean.low:.1f}, {mean.high:.1f}]"
+    return Cell(text, mean.value, n=len(curves), mark=mark)
+
+
+# --- how steady -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The spread of ODE-GRU-D beside that of another model at one observed share.
+
+    Attributes:
+        model: the other one.
+        fraction: observed share of the rows.
+        scoring: of the RMSE.
+        result: a ratio below 1 says that ODE-GRU-D is steadier; None where it cannot be tested.
+        p: of Pitman and Morgan's test, corrected by Holm over the observed shares and the models
+            of the thesis, or those that it does not have.
+        missing: why there is no result.
+    """
+
+    model: str
+    fraction: float
+    scoring: str
+    result: SpreadComparison | None = None
+    p: float | None = None
+    missing: str = ""
+
+
+def spreads(record: Record, scoring: str) -> tuple[Spread, ...]:
+    """Compares the spread of ODE-GRU-D with that of every other model, paired.
+
+    Args:
+        record: its runs of experiment 2.
+        scoring: of the RMSE.
+    """
+    found = list[Spread]()
+    for models in (thesis.MODELS, [m for m in MODELS if m not in thesis.MODELS]):
+        mine = []
+        for model in models:
+            if model != _OURS:
+                mine += [_spread(record, model, f, scoring) for f in thesis.FRACTIONS]
+        tested = [i for i, one in enumerate(mine) if _p(one) is not None]
+        if tested:
+            for i, p in zip(tested, holm([_p(mine[i]) or 0.0 for i in tested]), strict=True):
+                mine[i] = replace(mine[i], p=p)
+        found += mine
+    return tuple(found)
+
+
+def _p(one: Spread) -> float | None:
+    if one.result is None or one.result.pitman_morgan is None:
+        return None
+    return one.result.pitman_morgan.p
+
+
+def _spread(record: Record, model: str, fraction: float, scoring: str) -> Spread:
+    ours, other = paired_rmse(record, _OURS, model, fraction, scoring)
+    one = Spread(model, fraction, scoring)
+    try:
+        return replace(
+            one, result=spread_comparison(ours, other, names=(label(_OURS), label(model)))
+        )
+    except InputError as error:
+        return replace(one, missing=str(error))
+
+
+def spread_verdicts(found: Mapping[str, tuple[Spread, ...]]) -> dict[str, Verdict]:
+    """Is ODE-GRU-D the steadiest of the thesis' models?
+
+    Args:
+        found: of `spreads`, by scoring.
+    """
+    verdicts = {}
+    for scoring, shown in SCORINGS.items():
+        mine = [one for one in found[scoring] if one.model in thesis.MODELS]
+        tested = [one for one in mine if one.result is not None and one.p is not None]
+        told = [one for one in tested if (one.p or 0.0) <= thesis.ALPHA]
+        right = sum(one.result.ratio.value < 1 for one in told if one.result)
+        lower = sum(one.result.ratio.value < 1 for one in tested if one.result)
+        count = (
+            f"{label(_OURS)} spreads less in {lower} of {len(mine)} comparisons; in {right} of "
+            f"them the test tells so, and in {len(told) - right} it tells the opposite."
+        )
+        word = say.word(len(mine), len(tested), right, len(told) - right)
+        verdicts[shown] = Verdict(word, (count, *map(_spread_sentence, mine)))
+    return verdicts
+
+
+def _spread_sentence(one: Spread) -> str:
+    at = f"At {percent(one.fraction)}"
+    if one.result is None or one.p is None:
+        return f"{at}, {label(_OURS)} and {label(one.model)}: {one.missing}."
+    ratio = one.result.ratio
+    ends = "" if ratio.low is None else f" [{ratio.low:.2f}, {ratio.high:.2f}]"
+    return (
+        f"{at}, the standard deviation of {label(_OURS)} is {ratio.value:.2f}{ends} times that of "
+        f"{label(one.model)}: Pitman-Morgan {say.p_text(one.p)} after Holm, Levene "
+        f"{say.p_text(one.result.levene.p)}."
+    )
+
+
+def spread_table(record: Record, found: Mapping[str, tuple[Spread, ...]], *, number: str) -> Table:
+    """Standard deviation of the test RMSE over repeats, and ODE-GRU-D's beside each.
+
+    Args:
+        record: its runs of experiment 2.
+        found: of `spreads`, by scoring.
+        number: of the table.
+    """
+    blocks = []
+    for scoring in SCORINGS:
+        by_key = {(one.model, one.fraction): one for one in found[scoring]}
+        rows = []
+        for model in MODELS:
+            cells = []
+            for fraction in thesis.FRACTIONS:
+                runs, values = rmse_of(record, model, fraction, scoring)
+                if len(values) < 2:
+                    cells.append(Cell(n=len(values)))
+                    continue
+                spread = float(values.std(ddof=1))
+                one = by_key.get((model, fraction))
+                text, bold = f"{spread:.5f}", False
+                if one is not None and one.result is not None:
+                    text += f" ({one.result.ratio.value:.2f})"
+                    bold = one.p is not None and one.p <= thesis.ALPHA
+                mark = MIXED if record.mixed(runs) else ""
+                cells.append(Cell(text, spread, n=len(values), bold=bold, mark=mark))
+            rows.append((label(model), tuple(cells)))
+        blocks.append(Block(HEADINGS[scoring], tuple(rows)))
+    return Table(
+        number,
+        "Standard deviation of the test RMSE over the repeats; in brackets that of "
+        f"{label(_OURS)} over it, in the repeats that both have.",
+        "Model",
+        _COLUMNS,
+        tuple(blocks),
+        notes(
+            record,
+            blocks,
+            f"Below 1: {label(_OURS)} is steadier. Bold: Pitman and Morgan's test for pairs tells "
+            f"the two apart (p ≤ {thesis.ALPHA:g} after Holm).",
+        ),
+    )
