@@ -71,7 +71,7 @@ def test_curves_of_a_run_that_is_not_recorded_are_left_out(record):
     [
         ("honest_mse", np.nan, r"honest_mse of run 'e1-gru-90-r00' is nan"),
         ("published_mse", np.inf, "published_mse of run"),
-        ("seconds", -1.0, "expected finite and at least 0"),
+        ("seconds", -1.0, "expected a finite number of at least 0"),
         ("hidden_rows_0_share", 1.5, "expected from 0 to 1"),
         ("observed_fraction", 0.0, "observed_fraction of run"),
     ],
@@ -101,7 +101,7 @@ def test_a_record_without_runs_is_refused(record):
 def test_what_is_not_a_record_is_told_what_one_is(tmp_path):
     with pytest.raises(FileFormatError, match="not there; give the folder"):
         read_record(tmp_path / "nowhere")
-    with pytest.raises(FileFormatError, match="neither record.parquet nor record.csv"):
+    with pytest.raises(FileFormatError, match=r"neither record\.parquet nor record\.csv"):
         read_record(tmp_path)
     (tmp_path / "record.parquet").write_bytes(b"no table")
     with pytest.raises(FileFormatError, match=r"record\.parquet"):

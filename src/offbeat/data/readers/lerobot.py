@@ -356,8 +356,8 @@ class _Reading:
             raise FileFormatError(f"{at.file}: the rows of episode {number} do not stand together")
         stamps, zero, unit, said = self._stamps(episode, at.file)
         alone = len(self.chosen) == 1
-        names = [name for f in self.chosen for name in f.channels(alone=alone)]
-        signal = Signal("", stamps, _matrix(episode, self.chosen, at.file), tuple(names))
+        channels = [name for f in self.chosen for name in f.channels(alone=alone)]
+        signal = Signal("", stamps, _matrix(episode, self.chosen, at.file), tuple(channels))
         actions = None
         if self.acted:
             actions = Signal(
@@ -384,7 +384,8 @@ class _Reading:
         grid = np.rint(np.arange(episode.num_rows) * (1e9 / fps)).astype(np.int64)
         for name in self.clocks:
             clock = _raw(episode, name, file)
-            unit, said = "s", ()
+            unit = "s"
+            said: tuple[str, ...] = ()
             if name != "timestamp" or self.time_unit is not None:
                 unit, said = state_time_unit(
                     self.time_unit, name.rpartition(".")[2], clock, str(file)

@@ -133,8 +133,9 @@ class Layout:
             return None
         seconds: NDArray[np.int64]
         seconds = _numbers(table, row.stamp[0], self.order + "i4", 1)[:, 0].astype(np.int64)
-        nanoseconds = _numbers(table, row.stamp[1], self.order + "u4", 1)[:, 0]
-        return seconds * 1_000_000_000 + nanoseconds
+        nanoseconds = _numbers(table, row.stamp[1], self.order + "u4", 1)[:, 0].astype(np.int64)
+        stamps: NDArray[np.int64] = seconds * 1_000_000_000 + nanoseconds
+        return stamps
 
     def values(self, table: NDArray[np.uint8], row: Row) -> NDArray[np.float64]:
         """(messages, channels) the numbers, as float64."""
