@@ -37,6 +37,20 @@ check: .venv/.test ## install, then lint, check the format and the types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# The kernel's tests with the address and undefined-behaviour sanitizers, in a build of its own.
+SANITIZED := build/sanitized
+RUNTIME = $(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)
+
+.PHONY: sanitize
+sanitize: .venv/.test ## build the kernel with sanitizers, then run its tests
+	$(BIN)/python -m pip install -qq cmake nanobind ninja
+	$(BIN)/cmake -S . -B $(SANITIZED) -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja \
+		-DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -DOFFBEAT_SANITIZE=ON -DCMAKE_BUILD_TYPE=Release
+	$(BIN)/cmake --build $(SANITIZED)
+	LD_PRELOAD="$(RUNTIME)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1 \
+		OMP_NUM_THREADS=1 OFFBEAT_TEST_FUSED=$(CURDIR)/$(SANITIZED) \
+		$(BIN)/python -m pytest tests/test_kernels.py tests/test_fused_engine.py -n $(WORKERS) --timeout=1200 $(PYTEST_ARGS)
+
 .PHONY: clean
 clean: ## remove .venv and everything that was built or cached
 	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
@@ -61,11 +75,13 @@ define install
 	@rm .venv/.installing
 endef
 
-.venv/.sim: .venv/.made pyproject.toml constraints.txt
+SOURCES := pyproject.toml constraints.txt CMakeLists.txt $(wildcard csrc/*)
+
+.venv/.sim: .venv/.made $(SOURCES)
 	$(call install,sim)
 	@touch $@
 
-.venv/.test: .venv/.made pyproject.toml constraints.txt
+.venv/.test: .venv/.made $(SOURCES)
 	$(call install,test)
 	@touch .venv/.sim $@ # what the tests need holds what the demo needs
 

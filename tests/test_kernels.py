@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import itertools
+import os
+import shutil
 import weakref
 from dataclasses import replace
 from typing import Any
@@ -47,6 +49,15 @@ def agree(case: Problem, body: str, *, keep: bool = True, strict: bool = True) -
         allowed = max(allowed, 3 * float((value - exact[name]).abs().max()))
         found = float((got[name] - exact[name]).abs().max())
         assert found <= allowed, f"{name}: off by {found:.2g}, allowed {allowed:.2g}"
+
+
+def test_the_fused_body_is_there_wherever_it_could_be_built() -> None:
+    """Without a compiler the package installs all the same, and so would one that is broken."""
+    compilers = filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++"))
+    if not any(shutil.which(compiler) for compiler in compilers):
+        pytest.skip("no C++ compiler is here")
+    assert fused.bodies(), fused.why_not
+    assert kernels.body()[0] == fused.bodies()[0]
 
 
 # --- equal to the reference -----------------------------------------------------------------------

@@ -11,12 +11,23 @@ from typing import Any
 from offbeat import __version__
 
 CORE = ("torch", "numpy", "pyarrow", "safetensors", "jsonargparse", "matplotlib", "pillow")
-EXTRAS = {"sim": ("mujoco", "dm_control"), "track": ("tensorboard",)}
+EXTRAS = {
+    "sim": ("mujoco", "dm_control"),
+    "track": ("tensorboard",),
+    "ros": ("rosbags",),
+    "px4": ("pyulog",),
+    "hdf5": ("h5py",),
+    "umap": ("umap-learn",),
+    "export": ("onnx", "onnxscript", "onnxruntime"),
+    "cluster": ("ray", "submitit"),
+}
 
 
 def examine() -> dict[str, Any]:
     """Versions, threads, scan bodies and extras, as a flat record."""
     import torch
+
+    from offbeat.kernels import fused
 
     found: dict[str, Any] = {
         "offbeat": __version__,
@@ -27,7 +38,8 @@ def examine() -> dict[str, Any]:
         else os.cpu_count(),
         "torch threads": torch.get_num_threads(),
         "torch CUDA": torch.cuda.is_available(),
-        "scan bodies": "written out (GRU, one Euler step), reference (everything)",
+        "scan body": _scan_body(),
+        "compiled bodies": ", ".join(fused.bodies()) or f"none: {fused.why_not}",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
     }
     for name in CORE:
@@ -36,6 +48,17 @@ def examine() -> dict[str, Any]:
         for name in names:
             found[name] = _version(name) or f"missing; pip install 'offbeat[{extra}]'"
     return found
+
+
+def _scan_body() -> str:
+    from offbeat.errors import InputError
+    from offbeat.kernels import body
+
+    try:
+        name, why = body()
+    except InputError as error:
+        return f"none: {error}"
+    return f"{name} ({why})"
 
 
 def _version(name: str) -> str | None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from offbeat.config import check_seed
 from offbeat.inference.engine import Engine
+from offbeat.inference.fused_engine import FusedEngine
 from offbeat.inference.live import Frame, LiveStream
 from offbeat.inference.policies import StreamPolicies, with_options
 from offbeat.inference.torch_engine import TorchEngine
@@ -63,5 +64,7 @@ class Stream(LiveStream):
 
 
 def engine_of(model: RecurrentModel, *, seed: int) -> Engine:
-    """The fastest engine that runs a model."""
+    """The fastest engine that runs a model: compiled code where it can, else torch."""
+    if model.runs_fused():
+        return FusedEngine(model, seed=seed)
     return TorchEngine(model, seed=seed)
