@@ -34,7 +34,7 @@ else:
 TAPE_LIMIT = 256 * 2**20
 """Bytes. A forward pass that would keep more than this for its backward pass keeps only the states
 (`state_size` floats per row, twice), and the backward pass computes the rest again, a few rows at a
-time: about a quarter more time (`benchmarks/scan_memory.py`)."""
+time (`benchmarks/scaling.py` says what that costs)."""
 
 _CELLS = {"none": 0, "set": 1, "elman": 2, "lstm": 3, "gru": 4}
 _ACTIVATIONS = {"tanh": 0, "silu": 1}

@@ -1,0 +1,138 @@
+"""How the cost of a scan, forward and backward, grows with what it is given.
+
+Each sweep changes one thing and keeps the rest at the protocol's size (batch 50, 100 rows, 14
+channels, hidden 15, a vector field of four layers of 100 units); its points take turns. A cost that
+grows in proportion has `per_unit` 1 all along.
+
+    python benchmarks/scaling.py --json results/benchmarks/scaling.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from common import machine, synthetic, write
+
+import offbeat as ob
+from offbeat.kernels import fused
+from offbeat.training import Examples, threads_for
+
+BASE: dict[str, Any] = {"batch": 50, "rows": 100, "hidden": 15, "units": 100, "observed": 0.3}
+SWEEPS: dict[str, list[Any]] = {
+    "rows": [25, 50, 100, 200, 400],
+    "batch": [16, 32, 64, 128, 256],
+    "hidden": [15, 32, 64, 128],
+    "units": [50, 100, 200, 400],
+    "observed": [0.1, 0.3, 0.5, 0.9],
+}
+
+
+def ragged(n: int, rows: int, seed: int = 0) -> ob.Dataset:
+    """Each trajectory has 30 rows at times of its own; together they have hundreds."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for _ in range(n):
+        times = np.sort(rng.choice(rows * 20, rows, replace=False)) * 0.00025
+        made.append(ob.Trajectory(times, 0.05 * rng.normal(size=(rows, 14)).cumsum(axis=0)))
+    return ob.Dataset(tuple(made))
+
+
+def step_of(data: ob.Dataset, name: str, **options: Any) -> Callable[[], None]:
+    """Loss and its gradient for a whole data set as one batch."""
+    model = ob.make(ob.thesis_config(name, **options), data, seed=0)
+    examples = Examples(model, model.batch(data))
+    index = torch.arange(len(examples))
+
+    def step() -> None:
+        with threads_for(model):
+            model.zero_grad()
+            examples.loss(model, index, None).backward()
+
+    return step
+
+
+def point(name: str, **changed: Any) -> Callable[[], None]:
+    """A step at one point of a sweep."""
+    size = {**BASE, **changed}
+    data = synthetic(size["batch"], size["rows"], observed_fraction=size["observed"])
+    units = (size["units"],) * 4
+    return step_of(data, name, hidden_size=size["hidden"], field_units=units)
+
+
+def in_turn(steps: dict[Any, Callable[[], None]], repeats: int) -> dict[Any, float]:
+    """Median time of each, ms; they take turns."""
+    for step in steps.values():
+        step()
+    times: dict[Any, list[float]] = {key: [] for key in steps}
+    for _ in range(repeats):
+        for key, step in steps.items():
+            start = time.perf_counter()
+            step()
+            times[key].append(1e3 * (time.perf_counter() - start))
+    return {key: statistics.median(each) for key, each in times.items()}
+
+
+def with_limit(step: Callable[[], None], limit: int) -> Callable[[], None]:
+    """The same step under another limit of the memory that a forward pass may keep."""
+
+    def limited() -> None:
+        kept, fused.TAPE_LIMIT = fused.TAPE_LIMIT, limit
+        try:
+            step()
+        finally:
+            fused.TAPE_LIMIT = kept
+
+    return limited
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--model", default="ode_gru_d")
+    parser.add_argument("--json")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    found: dict[str, Any] = {}
+    for what, values in SWEEPS.items():
+        times = in_turn({v: point(options.model, **{what: v}) for v in values}, options.repeats)
+        first = times[values[0]] / float(values[0])
+        found[what] = {
+            str(v): {"ms": round(ms, 2), "per_unit": round(ms / float(v) / first, 2)}
+            for v, ms in times.items()
+        }
+        for v, ms in times.items():
+            print(f"{what:10} {v!s:>6} {ms:9.1f} ms   per unit x{ms / float(v) / first:.2f}")
+    own = ragged(50, 30)
+    union = len(np.unique(np.concatenate([t.times for t in own])))
+    times = in_turn(
+        {
+            "30 rows on one grid": point(options.model, rows=30),
+            "30 rows, each at its own times": step_of(own, options.model),
+        },
+        options.repeats,
+    )
+    found["own time grids"] = {"rows of the union": union, **times}
+    print(f"own grids  {times}, rows of the union: {union}")
+    step = point(options.model)
+    times = in_turn(
+        {
+            "stored": with_limit(step, 2**60),
+            "computed again": with_limit(step, 0),
+        },
+        options.repeats,
+    )
+    found["inner activations"] = times
+    print(f"inner activations: {times}")
+    write(options.json, {"machine": machine(), "options": vars(options), "sweeps": found})
+
+
+if __name__ == "__main__":
+    main()
