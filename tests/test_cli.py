@@ -264,18 +264,32 @@ def test_data_of_other_channels_and_a_damaged_checkpoint_are_refused(run, data, 
     assert "damaged" in one_line_error(capsys, "evaluate", copy, data)
 
 
-def test_times_that_do_not_increase_are_named_with_row_and_values(run, data, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("times", "options", "said"),
+    [
+        (("0.0", "0.2", "0.1"), ["--reader.order", "refuse"], ("order", "0.1")),
+        (("0.0", "nan", "0.1"), [], ("time",)),
+        (("0.0", "inf", "0.1"), [], ("inf",)),
+    ],
+)
+def test_times_that_cannot_be_used_are_named(run, data, tmp_path, capsys, times, options, said):
     names = ob.load(data).names
-    for times, said in (
-        (("0.0", "0.2", "0.1"), ("0.2", "0.1")),
-        (("0.0", "nan", "0.1"), ("time",)),
-        (("0.0", "inf", "0.1"), ("inf",)),
-    ):
-        path = tmp_path / "log.csv"
-        with path.open("w", newline="") as file:
-            csv.writer(file).writerows([["time", *names], *([t, *[1.0] * 14] for t in times)])
-        error = one_line_error(capsys, "predict", run, path, tmp_path / "out.csv")
-        assert all(word in error for word in said), error
+    path = tmp_path / "log.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([["time", *names], *([t, *[1.0] * 14] for t in times)])
+    error = one_line_error(capsys, "predict", run, path, tmp_path / "out.csv", *options)
+    assert all(word in error for word in said), error
+
+
+def test_rows_out_of_order_are_sorted_by_default(run, data, tmp_path):
+    names = ob.load(data).names
+    path, out = tmp_path / "log.csv", tmp_path / "out.csv"
+    with path.open("w", newline="") as file:
+        rows = ([t, *[1.0] * 14] for t in ("0.0", "0.2", "0.1"))
+        csv.writer(file).writerows([["time", *names], *rows])
+    assert main(["predict", str(run), str(path), str(out)]) == 0
+    with out.open(newline="") as file:
+        assert [float(row["time"]) for row in csv.DictReader(file)] == [0.0, 0.1, 0.2]
 
 
 def test_a_channel_that_is_never_observed_is_named(tmp_path, capsys):

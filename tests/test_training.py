@@ -232,7 +232,7 @@ def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkp
     import offbeat.training as training
 
     steps = 0
-    step = training._step
+    step = training.train_step
 
     def poisoned(model, *args, **kwargs):
         nonlocal steps
@@ -243,14 +243,14 @@ def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkp
                 next(model.parameters()).fill_(float("nan"))
         return loss
 
-    monkeypatch.setattr(training, "_step", poisoned)
+    monkeypatch.setattr(training, "train_step", poisoned)
     model = ob.make("gru", TRAIN, **SMALL)
     config = ob.TrainConfig(epochs=5, batch_size=4)
     with pytest.raises(ob.DivergenceError, match=r"nan in epoch 3, step 2.*last good checkpoint"):
         ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     kept = sorted((tmp_path / "checkpoints").iterdir())
     assert [folder.name for folder in kept] == ["steps-000000006"]
-    monkeypatch.setattr(training, "_step", step)
+    monkeypatch.setattr(training, "train_step", step)
     again = ob.make("gru", TRAIN, **SMALL)
     ob.fit(again, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     assert all(bool(torch.isfinite(p).all()) for p in again.parameters())
