@@ -13,7 +13,8 @@ import importlib.util
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from typing import Any, NamedTuple
 
 import torch
 from common import machine, synthetic, write
@@ -27,7 +28,14 @@ from offbeat.training import Examples, threads_for, train_step
 MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
 
 
-def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Callable[[], float]:
+class Contestant(NamedTuple):
+    """A step, which returns the loss before it, and what to be in while it is timed."""
+
+    step: Callable[[], float]
+    around: Callable[[], AbstractContextManager[Any]] = nullcontext
+
+
+def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Contestant:
     """A training step of this library in one of its bodies."""
     model = ob.make(config, data, seed=0)
     examples = Examples(model, model.batch(data))
@@ -36,48 +44,59 @@ def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Callable[[], fl
     index = torch.arange(len(examples))
 
     def step() -> float:
-        with kernels.use(body), threads_for(model):
-            return train_step(model, examples, index, state, training, total=1)
+        return train_step(model, examples, index, state, training, total=1)
 
-    return step
+    def around() -> ExitStack:  # as `fit` enters once for all of a training
+        stack = ExitStack()
+        stack.enter_context(kernels.use(body))
+        stack.enter_context(threads_for(model))
+        return stack
+
+    return Contestant(step, around)
 
 
-def contestants(name: str, data: ob.Dataset) -> dict[str, Callable[[], float]]:
+def contestants(name: str, data: ob.Dataset) -> dict[str, Contestant]:
     """Everyone who can run a model here."""
     config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
     model = ob.make(config, data, seed=0)
     batch = model.batch(data)
     rows, _ = model.facts(batch)
     facts = facts_of(rows, batch.values)
-    found: dict[str, Callable[[], float]] = {}
+    found: dict[str, Contestant] = {}
     if kernels.fused.bodies():
         found["ours, fused"] = ours(config, data, "fused")
     found["ours, reference"] = ours(config, data, "reference")
-    found["eager torchdiffeq" if model.spec.field else "eager torch"] = TorchContestant(
-        model, facts
+    found["eager torchdiffeq" if model.spec.field else "eager torch"] = Contestant(
+        TorchContestant(model, facts)
     )
     if importlib.util.find_spec("jax"):
-        found["JAX, jitted scan"] = JaxContestant(model, facts)
+        found["JAX, jitted scan"] = Contestant(JaxContestant(model, facts))
     return found
 
 
 def measure(name: str, data: ob.Dataset, repeats: int) -> dict[str, Any]:
     """Times of all contestants in turn, ms."""
-    steps = contestants(name, data)
-    first = {who: step() for who, step in steps.items()}
+    everyone = contestants(name, data)
+
+    def timed(who: str) -> tuple[float, float]:
+        contestant = everyone[who]
+        with contestant.around():
+            time.sleep(0.02)  # the idle threads of the contestant before go to sleep
+            start = time.perf_counter()
+            loss = contestant.step()
+            return loss, 1e3 * (time.perf_counter() - start)
+
+    first = {who: timed(who)[0] for who in everyone}
     expected = first["ours, reference"]
     for who, loss in first.items():
         if abs(loss - expected) > 1e-4 * abs(expected):
             raise SystemExit(f"{name}: {who} computes the loss {loss}, the reference {expected}")
-    for step in steps.values():
-        step()
-    times: dict[str, list[float]] = {who: [] for who in steps}
+    for who in everyone:
+        timed(who)
+    times: dict[str, list[float]] = {who: [] for who in everyone}
     for _ in range(repeats):
-        for who, step in steps.items():
-            time.sleep(0.02)  # the idle threads of the contestant before go to sleep
-            start = time.perf_counter()
-            step()
-            times[who].append(1e3 * (time.perf_counter() - start))
+        for who in everyone:
+            times[who].append(timed(who)[1])
     own = times.get("ours, fused", times["ours, reference"])
     result = {}
     for who, each in times.items():
