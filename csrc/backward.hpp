@@ -34,36 +34,36 @@ static INLINE void outer_tile(int pairs, int W, const T* const* to_out, int o, c
     for (int v = 0; v < NV; ++v) store<T>(sum + (o + r) * in + i + v * VW, acc[r][v]);
 }
 
-template <int R>
-static INLINE void outer_rows(int pairs, int W, const T* const* to_out, int o, const T* xt, int in,
-                              int i, T* sum) {
-  if (in - i >= 2 * VW)
-    outer_tile<R, 2>(pairs, W, to_out, o, xt, in, i, sum);
-  else
-    outer_tile<R, 1>(pairs, W, to_out, o, xt, in, i, sum);
+// All outputs against one strip of NV vectors of inputs; R * NV sums at a time hide their latency.
+template <int R, int NV>
+static NOINLINE void outer_strip(int pairs, int W, const T* const* to_out,
+                                                  int out, const T* xt, int in, int i, T* sum) {
+  int o = 0;
+  for (; o + R <= out; o += R) outer_tile<R, NV>(pairs, W, to_out, o, xt, in, i, sum);
+  for (; o < out; ++o) outer_tile<1, NV>(pairs, W, to_out, o, xt, in, i, sum);
 }
 
 // [unit][lane] to [lane][unit], units padded with zeros.
 static void turn(const T* x, int units, int padded, int W, T* xt) {
+  T* lanes[2 * VW];
   for (int lane = 0; lane < W; ++lane) {
-    T* to = xt + int64_t(lane) * padded;
-    for (int u = 0; u < units; ++u) to[u] = x[int64_t(u) * W + lane];
-    for (int u = units; u < padded; ++u) to[u] = 0;
+    lanes[lane] = xt + int64_t(lane) * padded;
+    for (int u = units; u < padded; ++u) lanes[lane][u] = 0;
   }
+  units_to_lanes(x, units, W, W, lanes);
 }
 
-static void add_pairs(const Matrix& m, int pairs, int W, const T* const* to_out, const T* const* x,
+static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, const T* const* to_out, const T* const* x,
                       T* sums, T* xt) {
   const int in = up(m.in, VW);
   T* sum = sums + m.sum;
   for (int first = 0; first < pairs; first += PAIRS_AT_ONCE) {
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
     for (int e = 0; e < n; ++e) turn(x[first + e], m.in, in, W, xt + int64_t(e) * W * in);
-    for (int i = 0; i < in; i += 2 * VW) {
-      int o = 0;
-      for (; o + 4 <= m.out; o += 4) outer_rows<4>(n, W, to_out + first, o, xt, in, i, sum);
-      for (; o < m.out; ++o) outer_rows<1>(n, W, to_out + first, o, xt, in, i, sum);
-    }
+    int i = 0;
+    for (; i + 3 * VW <= in; i += 3 * VW)
+      outer_strip<4, 3>(n, W, to_out + first, m.out, xt, in, i, sum);
+    for (; i < in; i += VW) outer_strip<8, 1>(n, W, to_out + first, m.out, xt, in, i, sum);
   }
   if (m.bias < 0) return;
   for (int o = 0; o < m.out; ++o) {
@@ -126,7 +126,7 @@ struct Back {
 // From the gradient of a perceptron's result, which already lies at the end of `kept_gradients`, to
 // the one of its argument.
 template <class P>
-static void evaluate_backward(Back<P>& k, const Perceptron& shape, int first, const Net& n,
+static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int first, const Net& n,
                               const T* x, const T* kept, T* kept_gradients, T* to_x) {
   constexpr int W = P::W;
   T* to_out = kept_gradients;
@@ -148,7 +148,7 @@ static void evaluate_backward(Back<P>& k, const Perceptron& shape, int first, co
 
 // `g` comes as the gradient of the state after the row and leaves as the one before the gap.
 template <class P>
-static void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* g,
+static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* g,
                          const Job<T>& job, const Block& b, int row) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
@@ -278,7 +278,7 @@ static void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, 
 }
 
 template <class P>
-static void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stages, T* kept) {
+static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stages, T* kept) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
   const Layout<P>& l = c.l;
@@ -308,7 +308,7 @@ static void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stage
 
 // Fills the gradient of the gates; turns those of h and of the memory into the ones before.
 template <class P>
-static void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* gh, T* gc) {
+static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* gh, T* gc) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
   const Dims& d = c.map.d;

@@ -74,7 +74,7 @@ struct Scan {
     for (int i = 0; i < n; ++i) m.split[i] = each;
   }
 
-  static Map map(const Spec& s) {
+  static NOINLINE Map map(const Spec& s) {
     Map p{};
     p.d = dims(s);
     const Dims& d = p.d;
@@ -210,6 +210,40 @@ struct Scan {
     if (s.input_decay) pack_input_decay(p, flat, packed + p.stream - 2 * up(p.d.C, VW));
   }
 
+  // --- between [lane][unit], as callers have it, and [unit][lane] ---------------------------------
+
+  // out[unit * W + lane] = lanes[lane][unit]
+  static NOINLINE void lanes_to_units(const T* const* lanes, int units, int W, T* out) {
+    int first = 0;
+    if constexpr (FAST_TURN && sizeof(T) == 4)
+      if (units >= 8 && W % 8 == 0)
+        for (; first < units; first += 8) {
+          const int u = first + 8 <= units ? first : units - 8;  // the last eight may overlap
+          for (int lane = 0; lane < W; lane += 8)
+            turn_8_by_8([&](int i) { return lanes[lane + i] + u; },
+                        [&](int i) { return out + int64_t(u + i) * W + lane; });
+        }
+    for (int lane = 0; lane < W; ++lane)
+      for (int u = first; u < units; ++u) out[int64_t(u) * W + lane] = lanes[lane][u];
+  }
+  // lanes[lane][unit] = x[unit * W + lane], for the first `n` lanes
+  static NOINLINE void units_to_lanes(const T* x, int units, int n, int W, T* const* lanes) {
+    for (int lane = 0; lane < n; ++lane) {
+      int first = 0;
+      if constexpr (FAST_TURN && sizeof(T) == 4)
+        if (units >= 8 && lane + 8 <= n) {
+          for (; first < units; first += 8) {
+            const int u = first + 8 <= units ? first : units - 8;
+            turn_8_by_8([&](int i) { return x + int64_t(u + i) * W + lane; },
+                        [&](int i) { return lanes[lane + i] + u; });
+          }
+          lane += 7;
+          continue;
+        }
+      for (int u = first; u < units; ++u) lanes[lane][u] = x[int64_t(u) * W + lane];
+    }
+  }
+
   // --- affine maps ----------------------------------------------------------------------------------
 
   // y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order.
@@ -244,7 +278,7 @@ struct Scan {
     static constexpr bool ONE = false;
     static int pad(int n) { return n; }
     template <bool ACCUMULATE>
-    static void affine(const Matrix& m, const T* packed, const T* x, T* y) {
+    static NOINLINE void affine(const Matrix& m, const T* packed, const T* x, T* y) {
       const T* w = packed + m.panels;
       const T* bias = m.bias >= 0 ? packed + m.packed_bias : nullptr;
       for (int o = 0; o < m.out; o += TILE)
@@ -253,7 +287,7 @@ struct Scan {
     }
     // x[k] (+)= sum over o of w[o][k] y[o]
     template <bool ACCUMULATE>
-    static void transposed(const Matrix& m, const T* packed, const T* y, T* x) {
+    static NOINLINE void transposed(const Matrix& m, const T* packed, const T* y, T* x) {
       const T* w = packed + m.transposed;
       for (int i = 0; i < m.backward_in; i += TILE)
         panel<NV, ACCUMULATE>(w + int64_t(i) * m.out, nullptr,
@@ -279,7 +313,7 @@ struct Scan {
     static constexpr bool ONE = true;
     static int pad(int n) { return up(n, VW); }
     template <bool ACCUMULATE>
-    static void affine(const Matrix& m, const T* packed, const T* x, T* y) {
+    static NOINLINE void affine(const Matrix& m, const T* packed, const T* x, T* y) {
       const T* w = packed + m.stream_panels;
       const T* bias = m.bias >= 0 ? packed + m.stream_bias : nullptr;
       const int first = m.in_split, second = m.in - first;
@@ -324,7 +358,7 @@ struct Scan {
   };
 
   template <class P>
-  static INLINE void activate(int activation, int units, const T* z, T* value, T* slope) {
+  static NOINLINE void activate(int activation, int units, const T* z, T* value, T* slope) {
     if (activation == TANH) {
       P::each(units, [&](int64_t i, int) { store<T>(value + i, tanh_(load<T>(z + i))); });
       return;
@@ -337,7 +371,7 @@ struct Scan {
   }
   // to_z = to_value * slope; of tanh the slope follows from the value
   template <class P>
-  static INLINE void activate_backward(int activation, int units, const T* value, const T* slope,
+  static NOINLINE void activate_backward(int activation, int units, const T* value, const T* slope,
                                        const T* to_value, T* to_z) {
     if (activation == TANH) {
       P::each(units, [&](int64_t i, int) {
@@ -425,11 +459,16 @@ struct Scan {
   struct Facts {
     T *gap, *update, *updated, *alive, *values, *mask, *age, *start, *end, *delta, *last;
     const T* mean;
+    T* nothing;  // zeros for a lane that has ended
     bool active = false, fed = false;
   };
   static constexpr int LANE_FACTS = 4;
   static int facts_size(const Dims& d, int lanes) {
-    return LANE_FACTS * (lanes < VW ? VW : lanes) + (4 * d.C + d.ages + 2 * d.F) * lanes;
+    return LANE_FACTS * (lanes < VW ? VW : lanes) + (4 * d.C + d.ages + 2 * d.F) * lanes +
+           widest_fact(d);
+  }
+  static int widest_fact(const Dims& d) {
+    return up(d.C > d.ages ? (d.C > d.F ? d.C : d.F) : (d.ages > d.F ? d.ages : d.F), 16);
   }
   template <class P>
   static Facts<P> facts(const Dims& d, T* at) {
@@ -442,10 +481,12 @@ struct Scan {
     f.end = at, at += d.F * P::W;
     f.delta = at, at += d.C * P::W;
     f.last = at, at += d.C * P::W;
+    f.nothing = at;
+    zero(f.nothing, widest_fact(d));
     return f;
   }
   template <class P>
-  static void gather(const Job<T>& job, const Dims& d, const Block& b, int row, Facts<P>& f) {
+  static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, int row, Facts<P>& f) {
     f.fed = job.rows.fed && job.rows.fed[row];
     f.active = false;
     for (int lane = 0; lane < P::W; ++lane) {
@@ -459,22 +500,23 @@ struct Scan {
       f.update[lane] = one(job.rows.update);
       f.updated[lane] = one(job.rows.updated);
       f.active |= d.cell && f.update[lane] != 0;
-      auto many = [&](const Fact<T>& fact, int n, T* out) {
-        if (!fact.data) return;
-        const T* p = fact.data + at * fact.by_lane + row * fact.by_row;
-        if (alive)
-          for (int u = 0; u < n; ++u) out[u * P::W + lane] = p[u];
-        else
-          for (int u = 0; u < n; ++u) out[u * P::W + lane] = 0;
-      };
-      many(job.rows.values, d.C, f.values);
-      many(job.rows.mask, d.C, f.mask);
-      many(job.rows.age, d.ages, f.age);
-      many(job.rows.decay_start, d.F, f.start);
-      many(job.rows.decay_end, d.F, f.end);
-      many(job.rows.delta, d.C, f.delta);
-      many(job.rows.last, d.C, f.last);
     }
+    auto many = [&](const Fact<T>& fact, int n, T* out) {
+      if (!fact.data || !n) return;
+      const T* lanes[P::W];
+      for (int lane = 0; lane < P::W; ++lane)
+        lanes[lane] = f.alive[lane] != 0 ? fact.data + int64_t(job.order[b.first + lane]) * fact.by_lane +
+                                               row * fact.by_row
+                                         : f.nothing;
+      lanes_to_units(lanes, n, P::W, out);
+    };
+    many(job.rows.values, d.C, f.values);
+    many(job.rows.mask, d.C, f.mask);
+    many(job.rows.age, d.ages, f.age);
+    many(job.rows.decay_start, d.F, f.start);
+    many(job.rows.decay_end, d.F, f.end);
+    many(job.rows.delta, d.C, f.delta);
+    many(job.rows.last, d.C, f.last);
     f.mean = job.rows.mean;
   }
 
@@ -499,7 +541,7 @@ struct Scan {
   // --- forward --------------------------------------------------------------------------------------
 
   template <class P>
-  static void evaluate(const Context<P>& c, const Perceptron& shape, int first, const Net& n,
+  static NOINLINE void evaluate(const Context<P>& c, const Perceptron& shape, int first, const Net& n,
                        const T* x, T* kept, T* out, T* z) {
     for (int l = 0; l < shape.layers; ++l) {
       const Matrix& m = c.map.m[first + l];
@@ -529,7 +571,7 @@ struct Scan {
   }
 
   template <class P>
-  static void row_forward(const Context<P>& c, const Facts<P>& f, T* state, T* tape) {
+  static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* state, T* tape) {
     const Spec& s = c.s;
     const Dims& d = c.map.d;
     const Layout<P>& l = c.l;
@@ -645,7 +687,7 @@ struct Scan {
 
   // One step of each lane's own span; the stages and their layers stay on the tape.
   template <class P>
-  static void runge_kutta(const Context<P>& c, const T* span, T* state, T* stages, T* z) {
+  static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T* stages, T* z) {
     const Spec& s = c.s;
     const Layout<P>& l = c.l;
     constexpr int W = P::W;
@@ -677,7 +719,7 @@ struct Scan {
 
   // `gate` holds the input's part and becomes the activated gates.
   template <class P>
-  static void cell_forward(const Context<P>& c, const Facts<P>& f, T* h, T* memory, T* gate,
+  static NOINLINE void cell_forward(const Context<P>& c, const Facts<P>& f, T* h, T* memory, T* gate,
                            T* held, T* hidden) {
     const Spec& s = c.s;
     const Dims& d = c.map.d;
@@ -762,32 +804,25 @@ struct Scan {
   }
 
   template <class P>
-  static void scatter(const Job<T>& job, const Block& b, const Grid<T>& grid, int row,
+  static NOINLINE void scatter(const Job<T>& job, const Block& b, const Grid<T>& grid, int row,
                       const T* state, int units) {
     if (!grid.data) return;
-    for (int lane = 0; lane < b.lanes; ++lane) {
-      T* out = grid.data + job.order[b.first + lane] * grid.by_lane + row * grid.by_row;
-      for (int u = 0; u < units; ++u) out[u] = state[int64_t(u) * P::W + lane];
-    }
+    T* lanes[P::W];
+    for (int lane = 0; lane < b.lanes; ++lane)
+      lanes[lane] = grid.data + job.order[b.first + lane] * grid.by_lane + row * grid.by_row;
+    units_to_lanes(state, units, b.lanes, P::W, lanes);
   }
   template <class P>
-  static void collect(const Job<T>& job, const Block& b, const Grid<T>& grid, int row, int units,
+  static NOINLINE void collect(const Job<T>& job, const Block& b, const Grid<T>& grid, int row, int units,
                       bool add, T* out) {
     if (!grid.data) {
       if (!add) zero(out, int64_t(units) * P::W);
       return;
     }
-    for (int lane = 0; lane < P::W; ++lane) {
-      if (lane >= b.lanes) {
-        if (!add)
-          for (int u = 0; u < units; ++u) out[int64_t(u) * P::W + lane] = 0;
-        continue;
-      }
+    if (!add) zero(out, int64_t(units) * P::W);
+    for (int lane = 0; lane < b.lanes; ++lane) {
       const T* in = grid.data + job.order[b.first + lane] * grid.by_lane + row * grid.by_row;
-      for (int u = 0; u < units; ++u) {
-        T& to = out[int64_t(u) * P::W + lane];
-        to = add ? to + in[u] : in[u];
-      }
+      for (int u = 0; u < units; ++u) out[int64_t(u) * P::W + lane] += in[u];
     }
   }
   static void zero(T* p, int64_t n) { __builtin_memset(p, 0, size_t(n) * sizeof(T)); }

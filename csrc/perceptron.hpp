@@ -34,6 +34,22 @@ static int64_t perceptron_scratch(const Perceptron& shape) {
 }
 static constexpr int PERCEPTRON_GROUP = 4;
 
+// Rows of a matrix become lanes; lanes beyond the last row are 0.
+template <class P>
+static void take_rows(const T* x, int64_t stride, int units, int lanes, T* out) {
+  const T* rows[P::W];
+  for (int lane = 0; lane < P::W; ++lane) rows[lane] = x + (lane < lanes ? lane : 0) * stride;
+  lanes_to_units(rows, units, P::W, out);
+  for (int lane = lanes; lane < P::W; ++lane)
+    for (int u = 0; u < units; ++u) out[int64_t(u) * P::W + lane] = 0;
+}
+template <class P>
+static void give_rows(const T* x, int units, int lanes, T* out, int64_t stride) {
+  T* rows[P::W];
+  for (int lane = 0; lane < lanes; ++lane) rows[lane] = out + lane * stride;
+  units_to_lanes(x, units, lanes, P::W, rows);
+}
+
 static void perceptron_forward(const PerceptronJob<T>& job, int64_t block, T* scratch) {
   using P = Many<2>;
   const Perceptron& shape = *job.shape;
@@ -45,14 +61,10 @@ static void perceptron_forward(const PerceptronJob<T>& job, int64_t block, T* sc
   T* z = scratch + row_size;
   T* out = z + int64_t(up(perceptron_widest(shape), VW)) * P::W;
   const int in = shape.sizes[0], n_out = shape.sizes[shape.layers];
-  for (int lane = 0; lane < P::W; ++lane) {
-    const T* x = first + lane < job.n ? job.x + (first + lane) * job.x_stride : nullptr;
-    for (int u = 0; u < in; ++u) tape[int64_t(u) * P::W + lane] = x ? x[u] : T(0);
-  }
+  const int lanes = job.n - first < P::W ? int(job.n - first) : P::W;
+  take_rows<P>(job.x + first * job.x_stride, job.x_stride, in, lanes, tape);
   evaluate<P>(c, shape, M_FIELD, net<P>(shape), tape, tape + int64_t(in) * P::W, out, z);
-  for (int lane = 0; lane < P::W && first + lane < job.n; ++lane)
-    for (int u = 0; u < n_out; ++u)
-      job.y[(first + lane) * n_out + u] = out[int64_t(u) * P::W + lane];
+  give_rows<P>(out, n_out, lanes, job.y + first * n_out, n_out);
 }
 
 static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratch) {
@@ -81,16 +93,11 @@ static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratc
     const int64_t first = block * P::W;
     T* to_layers = own + ((block - begin) % PERCEPTRON_GROUP) * int64_t(gradients) * P::W;
     T* to_out = to_layers + int64_t(gradients - n_out) * P::W;
-    for (int lane = 0; lane < P::W; ++lane) {
-      const T* g = first + lane < job.n ? job.to_y + (first + lane) * n_out : nullptr;
-      for (int u = 0; u < n_out; ++u) to_out[int64_t(u) * P::W + lane] = g ? g[u] : T(0);
-    }
+    const int lanes = job.n - first < P::W ? int(job.n - first) : P::W;
+    take_rows<P>(job.to_y + first * n_out, n_out, n_out, lanes, to_out);
     const T* tape = job.tape + block * row_size;
     evaluate_backward<P>(k, shape, M_FIELD, kept, tape, tape + int64_t(in) * P::W, to_layers, to_x);
-    if (job.to_x)
-      for (int lane = 0; lane < P::W && first + lane < job.n; ++lane)
-        for (int u = 0; u < in; ++u)
-          job.to_x[(first + lane) * in + u] = to_x[int64_t(u) * P::W + lane];
+    if (job.to_x) give_rows<P>(to_x, in, lanes, job.to_x + first * in, in);
     if ((block - begin) % PERCEPTRON_GROUP == PERCEPTRON_GROUP - 1 || block + 1 == end)
       flush(p, pairs, P::W, sums, xt);
   }

@@ -24,6 +24,7 @@ typedef Lanes<float>::V VF;
 typedef Lanes<double>::V VD;
 
 #define INLINE inline __attribute__((always_inline))
+#define NOINLINE __attribute__((noinline))  // large, called from many places: one copy is enough
 
 template <class T>
 INLINE typename Lanes<T>::V load(const T* p) {
@@ -52,8 +53,17 @@ INLINE VF fma(VF a, VF b, VF c) { return a * b + c; }
 INLINE VD fma(VD a, VD b, VD c) { return a * b + c; }
 #endif
 
-INLINE VF at_most(VF x, float bound) { return x > bound ? broadcast(bound) : x; }  // NaN stays NaN
+// NaN stays NaN: where one operand is, the processor's minimum and maximum give the second one.
+#if defined(__AVX512F__) && VECTOR_BYTES == 64
+INLINE VF at_most(VF x, float b) { return (VF)_mm512_min_ps((__m512)broadcast(b), (__m512)x); }
+INLINE VF at_least(VF x, float b) { return (VF)_mm512_max_ps((__m512)broadcast(b), (__m512)x); }
+#elif defined(__AVX__) && VECTOR_BYTES == 32
+INLINE VF at_most(VF x, float b) { return (VF)_mm256_min_ps((__m256)broadcast(b), (__m256)x); }
+INLINE VF at_least(VF x, float b) { return (VF)_mm256_max_ps((__m256)broadcast(b), (__m256)x); }
+#else
+INLINE VF at_most(VF x, float bound) { return x > bound ? broadcast(bound) : x; }
 INLINE VF at_least(VF x, float bound) { return x < bound ? broadcast(bound) : x; }
+#endif
 
 // e^x to about one unit in the last place: x = n ln 2 + r, a polynomial in r, n into the exponent.
 // Coefficients: least relative error on |r| <= ln(2) / 2.
@@ -107,3 +117,31 @@ template <class V>
 INLINE V sigmoid_(V x) {
   return 1 / (1 + exp_(-x));
 }
+
+// Turns 8 rows of 8 floats at `x(i)` into 8 rows at `y(i)`.
+#if defined(__AVX__)
+#define FAST_TURN 1
+template <class X, class Y>
+INLINE void turn_8_by_8(const X& x, const Y& y) {
+  __m256 r[8], t[8];
+  for (int i = 0; i < 8; ++i) r[i] = _mm256_loadu_ps(x(i));
+  for (int i = 0; i < 8; i += 2) {
+    t[i] = _mm256_unpacklo_ps(r[i], r[i + 1]);
+    t[i + 1] = _mm256_unpackhi_ps(r[i], r[i + 1]);
+  }
+  for (int i = 0; i < 8; i += 4) {
+    r[i] = _mm256_shuffle_ps(t[i], t[i + 2], 0x44);
+    r[i + 1] = _mm256_shuffle_ps(t[i], t[i + 2], 0xee);
+    r[i + 2] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0x44);
+    r[i + 3] = _mm256_shuffle_ps(t[i + 1], t[i + 3], 0xee);
+  }
+  for (int i = 0; i < 4; ++i) {
+    _mm256_storeu_ps(y(i), _mm256_permute2f128_ps(r[i], r[i + 4], 0x20));
+    _mm256_storeu_ps(y(i + 4), _mm256_permute2f128_ps(r[i], r[i + 4], 0x31));
+  }
+}
+#else
+#define FAST_TURN 0
+template <class X, class Y>
+INLINE void turn_8_by_8(const X&, const Y&) {}
+#endif

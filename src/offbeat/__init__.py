@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
     from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
+    from offbeat.report.comparison import Comparison, compare, read_runs
     from offbeat.scores import Score, Scores, row_0_constant
     from offbeat.training import FitResult, fit
 
@@ -39,6 +40,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "THESIS_MODELS": "models.zoo",
     "Batch": "data.batch",
+    "Comparison": "report.comparison",
     "Dataset": "data.trajectory",
     "Evaluation": "evaluation",
     "FitResult": "training",
@@ -50,6 +52,7 @@ _HOMES = {
     "Stream": "inference.stream",
     "StreamPolicies": "inference.policies",
     "Trajectory": "data.trajectory",
+    "compare": "report.comparison",
     "delta": "data.batch",
     "evaluate": "evaluation",
     "export_onnx": "inference.export",
@@ -61,6 +64,7 @@ _HOMES = {
     "parts": "data.prepare",
     "predict": "inference.predict",
     "read": "data.readers",
+    "read_runs": "report.comparison",
     "row_0_constant": "scores",
     "save": "data.store",
     "save_checkpoint": "models.checkpoint",
@@ -75,6 +79,7 @@ _HOMES = {
 __all__ = [
     "THESIS_MODELS",
     "Batch",
+    "Comparison",
     "Dataset",
     "DivergenceError",
     "Evaluation",
@@ -94,6 +99,7 @@ __all__ = [
     "StreamPolicies",
     "TrainConfig",
     "Trajectory",
+    "compare",
     "delta",
     "evaluate",
     "export_onnx",
@@ -105,6 +111,7 @@ __all__ = [
     "parts",
     "predict",
     "read",
+    "read_runs",
     "row_0_constant",
     "save",
     "save_checkpoint",

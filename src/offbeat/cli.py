@@ -6,15 +6,18 @@ Torch and everything else that is slow to import is imported inside the function
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
 from typing import Any
 
+from offbeat.commands.compare import compare_command
 from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
 from offbeat.commands.export import export_command
 from offbeat.commands.predict import predict_command
+from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
 from offbeat.commands.stream import stream_command
 from offbeat.commands.train import train_command
@@ -42,9 +45,14 @@ COMMANDS: dict[str, Any] = {
     "predict": predict_command,
     "stream": stream_command,
     "export": export_command,
+    "compare": compare_command,
     "demo": demo_command,
+    "reproduce": reproduce_command,
     "doctor": doctor_command,
 }
+
+# Commands that take any number of paths, as a shell hands them over.
+MANY_PATHS = ("compare",)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,14 +65,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     # Flags, although options made from bool arguments want a value.
-    flags = ("--json", "--stats")
+    flags = ("--json", "--stats", "--tiny")
     arguments = [f"{argument}=true" if argument in flags else argument for argument in arguments]
     if arguments == ["--version"]:
         from offbeat import __version__
 
         print(f"offbeat {__version__}")
         return 0
-    arguments = _configs_first(arguments)
+    arguments = _gather_paths(_configs_first(arguments))
     try:
         auto_cli(
             COMMANDS,
@@ -93,6 +101,28 @@ def _configs_first(arguments: list[str]) -> list[str]:
         configs += rest[at : at + width]
         rest = rest[:at] + rest[at + width :]
     return [*command, *configs, *rest]
+
+
+def _gather_paths(arguments: list[str]) -> list[str]:
+    """Makes one argument of the paths of a command that takes many: a list, as jsonargparse reads.
+
+    Each option but --help stands before its value, or holds it after an equals sign.
+    """
+    command, rest = arguments[:1], arguments[1:]
+    if not command or command[0] not in MANY_PATHS:
+        return arguments
+    paths: list[str] = []
+    options: list[str] = []
+    while rest:
+        first = rest.pop(0)
+        if not first.startswith("-"):
+            paths.append(first)
+            continue
+        options.append(first)
+        alone = "=" in first or first in ("-h", "--help") or first.startswith("--print_config")
+        if not alone and rest:
+            options.append(rest.pop(0))
+    return [*command, *([json.dumps(paths)] if paths else []), *options]
 
 
 def _fail(message: str, code: int) -> int:

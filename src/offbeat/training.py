@@ -21,7 +21,7 @@ from offbeat.data.batch import Batch
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
 from offbeat.files import writable
-from offbeat.kernels import ScanRows
+from offbeat.kernels import RowTable
 from offbeat.models.checkpoint import save_checkpoint
 from offbeat.models.recurrence import RecurrentModel
 from offbeat.run_state import (
@@ -113,7 +113,7 @@ def _fit(
                 f"{folder} holds a run of {state.epoch} epochs already, {config.epochs} were asked "
                 "for; give another folder"
             )
-    examples = Examples.of(model, batch)
+    examples = Examples(model, batch)
     stopped = _stopped(state, config)
     writer = _tensorboard(folder, state)
     with _progress_bar(state, config, len(batch), progress) as bar:
@@ -159,43 +159,44 @@ def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 
 # --- one epoch ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
 class Examples:
     """A training part in memory, as a step takes it: nothing is made anew from epoch to epoch.
 
-    Attributes:
-        rows: facts of each row.
-        targets: (batch, rows - 1, channels) scaled values of the rows after the first.
-        counted: (batch, rows - 1, channels) 1.0 where the loss counts a cell; None where it counts
-            all of them.
+    Args:
+        model: its scales and statistics make the facts of the rows.
+        batch: scaled.
     """
 
-    rows: ScanRows
-    targets: Tensor
-    counted: Tensor | None
-
-    @classmethod
-    def of(cls, model: RecurrentModel, batch: Batch) -> Examples:
-        """What training needs of a scaled batch."""
+    def __init__(self, model: RecurrentModel, batch: Batch) -> None:
         with torch.no_grad():
             rows, _ = model.facts(batch)
-        counted = (batch.known & batch.valid[..., None])[:, 1:]
-        targets = batch.values[:, 1:].contiguous()
-        return cls(rows, targets, None if bool(counted.all()) else counted.to(targets.dtype))
+        self.table = RowTable.of(rows)
+        # Flat, and without the first row: long runs of memory are quick to compare.
+        self.targets = batch.values[:, 1:].flatten(1).contiguous()
+        counted = (batch.known & batch.valid[..., None])[:, 1:].flatten(1)
+        self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self.table)
 
     def loss(self, model: RecurrentModel, index: Tensor, coins: torch.Generator | None) -> Tensor:
-        """Mean squared error of the one-step-ahead prediction of some trajectories."""
-        rows = self.rows.take(index)
-        predictions = model.run(rows, model.empty_carry(len(rows), coins=coins)).predictions[:, 1:]
-        targets = self.targets.index_select(0, index)[:, : rows.rows - 1]
-        if self.counted is None:
-            return mse_loss(predictions, targets) if targets.numel() else predictions.sum()
-        counted = self.counted.index_select(0, index)[:, : rows.rows - 1]
-        squared = (predictions - targets).square()
-        return (squared * counted).sum() / counted.sum().clamp_min(1)
+        """Mean squared error of the one-step-ahead prediction of some trajectories.
+
+        Args:
+            model: as it stands.
+            index: (batch,) positions of the trajectories.
+            coins: generator of the coins of self-feeding.
+        """
+        rows = self.table.take(index)
+        predictions = model.run(rows, coins=coins)[0].flatten(1)[:, model.channels :]
+        cells = predictions.shape[1]
+        targets = self.targets.index_select(0, index)[:, :cells]
+        if self.counted is None and cells:
+            return mse_loss(predictions, targets)
+        counted = torch.ones_like(targets)
+        if self.counted is not None:
+            counted = self.counted.index_select(0, index)[:, :cells]
+        return ((predictions - targets).square() * counted).sum() / counted.sum().clamp_min(1)
 
 
 def _epoch(

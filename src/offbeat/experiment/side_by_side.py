@@ -119,14 +119,15 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
 def _run_apart(job: Job, sender: Any) -> None:
     """A process that trains one model; it ends with the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     try:
         job.run(progress=False)
     except OffbeatError as error:
         sender.send(error)
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Ends this process when the one that started it ends; for a thread of its own."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -148,9 +149,16 @@ def _collect(job: Job, process: Any, receiver: Any) -> None:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Sums in one order, on any machine; and small steps are faster so."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with threads_of_torch(1):
+        yield
+
+
+@contextmanager
+def threads_of_torch(threads: int) -> Iterator[None]:
+    """So many threads for torch, inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(before)

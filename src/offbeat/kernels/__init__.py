@@ -19,6 +19,7 @@ from offbeat.kernels import fused, reference
 from offbeat.kernels.spec import (
     LARGEST_EXPONENT,
     Layers,
+    RowTable,
     ScanRows,
     ScanSpec,
     ScanWeights,
@@ -27,6 +28,7 @@ from offbeat.kernels.spec import (
 __all__ = [
     "LARGEST_EXPONENT",
     "Layers",
+    "RowTable",
     "ScanRows",
     "ScanSpec",
     "ScanWeights",

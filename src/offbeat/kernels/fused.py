@@ -45,6 +45,11 @@ def bodies() -> list[str]:
     return list(compiled.bodies()) if compiled is not None else []
 
 
+def suffix(dtype: torch.dtype) -> str:
+    """What the compiled module calls a type."""
+    return _TYPES[dtype]
+
+
 def unsupported(spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor) -> str:
     """Why the fused body can't run a scan; empty where it can."""
     if compiled is None:

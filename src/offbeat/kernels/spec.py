@@ -188,21 +188,61 @@ class ScanRows:
         """Rows of the longest trajectory."""
         return self.gap.shape[1]
 
-    def take(self, index: Tensor) -> ScanRows:
-        """The trajectories at these positions, trimmed to the longest of them."""
-        rows = self.rows
-        length = None
-        if self.length is not None:
-            length = self.length.index_select(0, index)
-            rows = int(length.max())
-        taken: dict[str, Any] = {"length": length, "fed": self.fed, "mean": self.mean}
-        moved: dict[int, Tensor] = {}  # one tensor may stand for two facts
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in taken:
+
+@dataclass(frozen=True, eq=False)
+class RowTable:
+    """The facts of many trajectories side by side in one tensor, so that a batch is one gather.
+
+    Attributes:
+        table: (trajectories, rows, columns).
+        places: of each fact: its name, its columns, and whether it has an axis of units.
+        mean: as `ScanRows.mean`.
+        length: as `ScanRows.length`.
+    """
+
+    table: Tensor
+    places: tuple[tuple[str, slice, bool], ...]
+    mean: Tensor | None
+    length: Tensor | None
+
+    @classmethod
+    def of(cls, rows: ScanRows) -> RowTable:
+        """Puts facts side by side.
+
+        Args:
+            rows: of all trajectories.
+        """
+        facts = {f.name: getattr(rows, f.name) for f in fields(rows)}
+        for name in ("mean", "length", "fed"):
+            facts.pop(name)
+        places, columns, known, width = [], [], {}, 0
+        for name, value in facts.items():
+            if value is None:
                 continue
-            if value is not None and id(value) not in moved:
-                part = value if rows == self.rows else value[:, :rows]
-                moved[id(value)] = part.index_select(0, index)
-            taken[field.name] = None if value is None else moved[id(value)]
-        return ScanRows(**taken)
+            if id(value) not in known:  # one tensor may stand for two facts
+                column = value if value.ndim == 3 else value[..., None]
+                known[id(value)] = slice(width, width + column.shape[2])
+                columns.append(column)
+                width += column.shape[2]
+            places.append((name, known[id(value)], value.ndim == 3))
+        return cls(torch.cat(columns, dim=2), tuple(places), rows.mean, rows.length)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def take(self, index: Tensor) -> ScanRows:
+        """Some trajectories, trimmed to the longest of them.
+
+        Args:
+            index: (batch,) positions.
+        """
+        length = None if self.length is None else self.length.index_select(0, index)
+        table = self.table
+        if length is not None:
+            table = table[:, : int(length.max())]
+        table = table.index_select(0, index)
+        facts: dict[str, Any] = {
+            name: table[..., at] if units else table[..., at.start]
+            for name, at, units in self.places
+        }
+        return ScanRows(**facts, mean=self.mean, length=length)

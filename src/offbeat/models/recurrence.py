@@ -143,12 +143,20 @@ class RecurrentModel(nn.Module):
             batch: number of trajectories.
             coins: generator of the coins of self-feeding; by default one seeded with 0.
         """
+        if coins is None and self.config.self_feeding:
+            coins = torch.Generator().manual_seed(0)
+        return Carry.empty(self.first_state(batch), self.mean, coins=coins)
+
+    def first_state(self, batch: int) -> Tensor:
+        """(batch, state_size) before anything is observed.
+
+        Args:
+            batch: number of trajectories.
+        """
         state = self.cell.bias.new_zeros(self.spec.state_size - self.spec.anchors)
         if self.start is not None:
             state = torch.cat([self.start, state])
-        if coins is None and self.config.self_feeding:
-            coins = torch.Generator().manual_seed(0)
-        return Carry.empty(state.expand(batch, -1), self.mean, coins=coins)
+        return state.expand(batch, -1)
 
     def forward(
         self, batch: Batch, *, carry: Carry | None = None, coins: torch.Generator | None = None
@@ -166,24 +174,42 @@ class RecurrentModel(nn.Module):
         if carry is None:
             carry = self.empty_carry(len(batch), coins=coins)
         rows, carried = self.facts(batch, carry)
-        return self.run(rows, carry, carried)
+        predictions, before, after = self.run(rows, carry.state, coins=carry.coins, seen=carry.rows)
+        carried = replace(carried, state=after[:, -1], updated=rows.update[:, -1] > 0)
+        return Output(predictions, before, after, carried)
 
-    def run(self, rows: ScanRows, carry: Carry, carried: Carry | None = None) -> Output:
-        """Predicts rows whose facts are known.
+    def run(
+        self,
+        rows: ScanRows,
+        state: Tensor | None = None,
+        *,
+        coins: torch.Generator | None = None,
+        seen: int = 0,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Predicts rows whose facts are known: all of `forward` that a weight touches.
 
         Args:
             rows: from `facts`.
-            carry: what was seen before them: state, coins, number of rows.
-            carried: from `facts`, where the rows that follow are of interest.
+            state: (batch, state_size) before them; by default as nothing has been seen.
+            coins: generator of the coins of self-feeding.
+            seen: number of rows before them.
+
+        Returns:
+            Predictions (batch, rows, channels), states before and after each row
+            (batch, rows, state_size).
         """
+        if state is None:
+            state = self.first_state(len(rows))
         if self.config.self_feeding:
-            rows = replace(rows, fed=_coins(carry, rows.rows, float(self.config.self_feeding)))
-        before, after = scan(self.spec, self.scan_weights(), rows, carry.state)
+            rows = replace(
+                rows, fed=_coins(coins, seen, rows.rows, float(self.config.self_feeding))
+            )
+        before, after = scan(self.spec, self.scan_weights(), rows, state)
         read = before
         if self.config.readout == "last_row":
-            read = torch.cat([carry.state[:, None], after[:, :-1]], dim=1)
-        carried = replace(carried or carry, state=after[:, -1], updated=rows.update[:, -1] > 0)
-        return Output(self.read(read), before, after, carried)
+            shifted = torch.cat([state, after.flatten(1)[:, : -self.spec.state_size]], dim=1)
+            read = shifted.view_as(after)
+        return self.read(read), before, after
 
     def read(self, state: Tensor) -> Tensor:
         """(..., state_size) states to (..., channels) predictions in scaled units."""
@@ -308,12 +334,12 @@ def _spec(
     )
 
 
-def _coins(carry: Carry, rows: int, share: float) -> tuple[bool, ...]:
+def _coins(coins: torch.Generator | None, seen: int, rows: int, share: float) -> tuple[bool, ...]:
     """One coin per row, drawn row by row so that a stream draws the same; never at row 0."""
-    if carry.coins is None:
+    if coins is None:
         raise InputError("self-feeding draws coins: the carry needs a generator (empty_carry)")
-    drawn = [float(torch.rand((), generator=carry.coins)) < share for _ in range(rows)]
-    return tuple(fed and carry.rows + i > 0 for i, fed in enumerate(drawn))
+    drawn = torch.rand(rows, generator=coins).tolist()  # the same draws as one by one
+    return tuple(coin < share and seen + i > 0 for i, coin in enumerate(drawn))
 
 
 def _decay(
