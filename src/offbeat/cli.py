@@ -55,9 +55,6 @@ COMMANDS: dict[str, Any] = {
     "export": export_command,
     "impute": impute_command,
     "extrapolate": extrapolate_command,
-    "stream": stream_command,
-    "export": export_command,
-    "compare": compare_command,
     "demo": demo_command,
     "reproduce": reproduce_command,
     "report": report_command,
@@ -83,8 +80,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     # Flags, although options made from bool arguments want a value.
     arguments = [f"{argument}=true" if argument in FLAGS else argument for argument in arguments]
-    flags = ("--json", "--stats", "--tiny")
-    arguments = [f"{argument}=true" if argument in flags else argument for argument in arguments]
     if arguments == ["--version"]:
         from offbeat import __version__
 
