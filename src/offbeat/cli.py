@@ -13,6 +13,7 @@ from typing import Any
 from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
+from offbeat.commands.inspect import inspect_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.simulate import simulate_command
 from offbeat.commands.train import train_command
@@ -35,6 +36,7 @@ Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 # lazy package `offbeat`, and import torch to look at them.
 COMMANDS: dict[str, Any] = {
     "simulate": simulate_command,
+    "inspect": inspect_command,
     "train": train_command,
     "evaluate": evaluate_command,
     "predict": predict_command,

@@ -18,26 +18,35 @@ _FEW_STEPS = 20
 _LATE_ROWS = 10  # rows after which a stamp that is late, and not set back, is over
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Disorder:
     """What is wrong with the order of stamps.
 
     Attributes:
-        late: rows whose stamp is lower than one before them.
-        duplicates: rows whose stamp another row before them has.
+        late: stamps of the rows that are lower than one before them.
+        duplicates: stamps of the rows that have that of another row.
     """
 
-    late: int
-    duplicates: int
+    late: Stamps
+    duplicates: Stamps
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a fault."""
+        return len(self.late) + len(self.duplicates) > 0
+
+
+_IN_ORDER = Disorder(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 
 def disorder(stamps: Stamps) -> Disorder:
-    """Counts rows that are late and stamps that repeat."""
-    steps = np.diff(stamps)
-    if (steps > 0).all():
-        return Disorder(0, 0)
-    late = int((stamps < np.maximum.accumulate(stamps)).sum())
-    return Disorder(late, len(stamps) - len(np.unique(stamps)))
+    """Finds rows that are late and stamps that repeat."""
+    if (np.diff(stamps) > 0).all():
+        return _IN_ORDER
+    ordered = np.sort(stamps)
+    return Disorder(
+        stamps[stamps < np.maximum.accumulate(stamps)], ordered[1:][np.diff(ordered) == 0]
+    )
 
 
 def clock_jumps(stamps: Stamps) -> Stamps:

@@ -16,6 +16,8 @@ from offbeat.data.signals import Recording, Signal
 from offbeat.data.trajectory import Trajectory
 from offbeat.errors import FileFormatError, InputError, one_of
 
+_DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
+
 
 @dataclass(frozen=True)
 class Channels:
@@ -33,7 +35,7 @@ class Channels:
 
         Raises:
             FileFormatError: there is no channel, names repeat, or units disagree.
-            InputError: `angles` names a channel that there is not.
+            InputError: `channels`, `without` or `angles` names a channel that there is not.
         """
         if not recordings:
             raise FileFormatError("there is nothing recorded to read; check the file")
@@ -71,22 +73,36 @@ class Channels:
             raise FileFormatError("there is no channel to read, only times")
         for name in policies.angles:
             kinds[names.index(one_of("channel in angles", name, names))] = "angle"
+        left_out = {one_of("channel in without", name, names) for name in policies.without}
+        chosen = tuple(name for name in policies.channels or names if name not in left_out)
+        if not chosen:
+            raise InputError(f"there are no channels but those to be left out: {', '.join(names)}")
+        kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
         fours = [at for at, kind in enumerate(kinds) if kind == "quaternion"]
+        whole = [fours[i : i + 4] for i in range(0, len(fours), 4)]
         return cls(
-            names,
-            tuple(units),
-            columns,
+            chosen,
+            tuple(units[at] for at in kept),
+            {key: kept[at] for key, at in columns.items() if at in kept},
             {
-                at: 360.0
-                if units[at].casefold() in ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
-                else 2 * np.pi
+                kept[at]: 360.0 if units[at].casefold() in _DEGREES else 2 * np.pi
                 for at, kind in enumerate(kinds)
-                if kind == "angle"
+                if kind == "angle" and at in kept
             },
-            tuple(tuple(fours[i : i + 4]) for i in range(0, len(fours), 4))
-            if policies.quaternions == "continuous"
-            else (),
+            tuple(
+                tuple(kept[at] for at in four)
+                for four in whole
+                if policies.quaternions == "continuous" and all(at in kept for at in four)
+            ),
         )
+
+    def keep(self, signal: Signal) -> Signal | None:
+        """The signal with those of its channels that are kept, or None."""
+        at = [i for i, name in enumerate(signal.channels) if (signal.name, name) in self.columns]
+        if len(at) == len(signal.channels):
+            return signal
+        names = tuple(signal.channels[i] for i in at)
+        return Signal(signal.name, signal.stamps, signal.values[:, at], names) if at else None
 
     def names_of(self, columns: Iterable[int]) -> tuple[str, ...]:
         """The names of some columns."""
@@ -102,6 +118,7 @@ class Episode:
     owned: bool  # whether values may be written to
     recording: Recording = field(repr=False)
     part: str = ""
+    faults: dict[str, float] = field(default_factory=dict)  # found here, by what they are called
 
     @property
     def label(self) -> str:
@@ -152,7 +169,8 @@ def cut(
     recording: Recording, channels: Channels, policies: Policies, account: Account
 ) -> list[Episode]:
     """The episodes of a recording: its clocks mended, its signals merged, split at outages."""
-    signals = [signal for signal in recording.signals if len(signal.stamps)]
+    kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
+    signals = [signal for signal in kept if signal is not None]
     if not signals:
         account.empty += 1
         return []
@@ -171,6 +189,7 @@ def cut(
                 values, infinite, owned, recording, channels, policies, account
             )
         del infinite
+        disorders = [faults.disorder(signal.stamps) for signal in piece]
         limit = faults.longest_allowed(stamps, policies.max_gap_s)
         cuts = np.zeros(0, dtype=np.int64)
         if limit is not None:
@@ -179,7 +198,13 @@ def cut(
             cuts = np.flatnonzero(steps > limit) + 1
             account.outages_s += (steps[cuts - 1] / 1e9).tolist()
         for start, end in zip([0, *cuts], [*cuts, len(stamps)], strict=True):
-            found.append(Episode(stamps[start:end], values[start:end], owned, bare))
+            episode = Episode(stamps[start:end], values[start:end], owned, bare)
+            episode.faults = _faults_in(episode.stamps, disorders)
+            if start:
+                episode.faults["outage_before_s"] = float(stamps[start] - stamps[start - 1]) / 1e9
+            elif found:
+                episode.faults["clock_set_before"] = 1
+            found.append(episode)
     if len(found) == 1:
         return found
     long = [episode for episode in found if len(episode.stamps) >= policies.min_rows]
@@ -187,6 +212,17 @@ def cut(
     for k, episode in enumerate(long, 1):
         episode.part = str(k)
     return long
+
+
+def _faults_in(stamps: NDArray[np.int64], disorders: Iterable[faults.Disorder]) -> dict[str, float]:
+    """How many rows between the first and the last stamp came late, or repeat one."""
+    counts: dict[str, float] = {}
+    for found in disorders:
+        for name, at in (("late", found.late), ("duplicates", found.duplicates)):
+            count = int(((at >= stamps[0]) & (at <= stamps[-1])).sum()) if len(at) else 0
+            if count:
+                counts[name] = counts.get(name, 0) + count
+    return counts
 
 
 def _pieces(
@@ -228,10 +264,10 @@ def _ordered(
     signal: Signal, recording: Recording, policies: Policies, account: Account
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     found = faults.disorder(signal.stamps)
-    if not (found.late or found.duplicates):
+    if not found.any:
         return signal.stamps, signal.values
-    refused = (found.late and policies.order == "refuse") or (
-        found.duplicates and policies.duplicates == "refuse"
+    refused = (len(found.late) and policies.order == "refuse") or (
+        len(found.duplicates) and policies.duplicates == "refuse"
     )
     if refused:
         stamps = signal.stamps
@@ -244,11 +280,13 @@ def _ordered(
             f"{row}; order=sort sorts late rows in, duplicates=last merges those of one stamp"
         )
     name = signal.name or (signal.channels[0] if len(signal.channels) == 1 else "rows")
-    account.late[name] += found.late
+    if len(found.late):
+        account.late[name] += len(found.late)
     stamps, values = faults.in_order(signal.stamps, signal.values, policies.order)
     before = len(stamps)
     stamps, values = faults.one_row_per_stamp(stamps, values, policies.duplicates)
-    account.duplicates[name] += before - len(stamps)
+    if before > len(stamps):
+        account.duplicates[name] += before - len(stamps)
     return stamps, values
 
 

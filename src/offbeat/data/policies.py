@@ -20,6 +20,9 @@ class Policies:
     counted in `Dataset.meta["report"]`.
 
     Attributes:
+        channels: names of the channels to keep, as a data set of all would call them, in the order
+            wanted; None keeps all. Rows in which none of them was logged are not read.
+        without: names of channels to leave out.
         order: rows whose stamp is lower than one before it: `sort` them in, `drop` them, or
             `refuse` the file.
         duplicates: of the known cells of a channel at one stamp the `last` or `first` one logged,
@@ -47,6 +50,8 @@ class Policies:
         InputError: a value is none of these.
     """
 
+    channels: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()
     order: Literal["sort", "drop", "refuse"] = "sort"
     duplicates: Literal["last", "first", "mean", "refuse"] = "last"
     clock_jumps: Literal["split", "join", "refuse"] = "split"
@@ -73,15 +78,24 @@ class Policies:
                 f"resample_hz must be above 0 and at most 1e9, or None to leave the rows where "
                 f"they are, got {rate!r}"
             )
-        if isinstance(self.angles, str) or not all(isinstance(a, str) for a in self.angles):
-            raise InputError(f"angles must be names of channels, got {self.angles!r}")
+        for name, names in (
+            ("channels", self.channels),
+            ("without", self.without),
+            ("angles", self.angles),
+        ):
+            if names is None:
+                continue
+            if isinstance(names, str) or not all(isinstance(one, str) for one in names):
+                raise InputError(f"{name} must be names of channels, got {names!r}")
+            object.__setattr__(self, name, tuple(dict.fromkeys(names)))
+        if self.channels == ():
+            raise InputError("channels must name at least one channel, or be None to keep all")
         if not isinstance(self.unwrap, bool):
             raise InputError(f"unwrap must be True or False, got {self.unwrap!r}")
         if isinstance(self.min_rows, bool) or not isinstance(self.min_rows, int):
             raise InputError(f"min_rows must be an integer, got {self.min_rows!r}")
         if self.min_rows < 1:
             raise InputError(f"min_rows must be at least 1, got {self.min_rows}")
-        object.__setattr__(self, "angles", tuple(self.angles))
 
 
 _CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -141,8 +155,13 @@ class Account:
     dropped: int = 0
     notes: dict[str, None] = field(default_factory=dict)
 
-    def report(self, policies: Policies) -> dict[str, Any]:
-        """Policy and finding of each kind of fault, JSON-like."""
+    def report(self, policies: Policies, episodes: list[dict[str, float]]) -> dict[str, Any]:
+        """Policy and finding of each kind of fault, JSON-like.
+
+        Args:
+            policies: that were applied.
+            episodes: of the trajectories with faults, the number and what was found there.
+        """
         p = policies
         limits = [min(self.limits_s), max(self.limits_s)] if self.limits_s else None
         return {
@@ -176,6 +195,7 @@ class Account:
                 "dropped": self.dropped,
             },
             "resample_hz": p.resample_hz,
+            "episodes": episodes,
             "notes": list(self.notes),
         }
 
@@ -229,7 +249,7 @@ def sentences(report: Mapping[str, Any]) -> list[str]:
             f"{sum(turns.values())} jumps by a turn were taken out of {_listed(list(turns))}"
         )
     quaternions = report["quaternions"]
-    if quaternions["channels"]:
+    if any(quaternions[fault] for fault in ("flipped", "renormalised", "dropped")):
         said.append(
             f"quaternions {_listed(['/'.join(four) for four in quaternions['channels']])}: "
             f"{quaternions['flipped']} rows changed sign, {quaternions['renormalised']} had "

@@ -50,7 +50,7 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
 
     Raises:
         FileFormatError: a policy refuses, or nothing is left.
-        InputError: `angles` names a channel that there is not.
+        InputError: `channels`, `without` or `angles` names a channel that there is not.
     """
     waiting: list[Recording | None] = list(recordings)
     given = [recording for recording in waiting if recording is not None]
@@ -87,7 +87,8 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
     starts = [_clock(episode, unit) for episode in episodes]
     if policies.start == "first_row" and any(starts):
         meta["clock_start"] = starts
-    return Dataset(trajectories, {**meta, "report": account.report(policies)})
+    faulty = [{"episode": i, **e.faults} for i, e in enumerate(episodes) if e.faults]
+    return Dataset(trajectories, {**meta, "report": account.report(policies, faulty)})
 
 
 def _mask_held(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import inspect
+import logging
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
@@ -98,8 +99,9 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
             `Policies`, which every format has but our own.
 
     Returns:
-        The data set. Its `meta["report"]` says what the policies did, and its `meta["source"]`
-        where it came from.
+        The data set. Its `meta["report"]` says what the policies did, `meta["source"]` where it
+        came from. What a reader had to assume (a unit of time found by the numbers, say) stands in
+        `meta["report"]["notes"]`, and is logged as a warning of the logger `offbeat`.
 
     Raises:
         FileFormatError: the file is missing, of no known format, or not what its format asks for.
@@ -108,8 +110,7 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
     path = require_source(path)
     load_entry_points()
     reader = reader_of(path) if format is None else READERS[one_of("format", format, READERS)]
-    own = reader.options
-    known = [*own, *(POLICIES if reader.policies else ())]
+    own, known = reader.options, options_of(reader)
     for option in options:
         if not known:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
@@ -124,7 +125,14 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
             )
         return made
     dataset = assemble(made, Policies(**policies))
+    for note in dataset.meta["report"]["notes"]:
+        logging.getLogger("offbeat").warning("%s: %s", path, note)
     return replace(dataset, meta={"source": path.name, "format": reader.name, **dataset.meta})
+
+
+def options_of(reader: Reader) -> list[str]:
+    """All options of a format: its own, and the policies where they apply."""
+    return list(dict.fromkeys([*reader.options, *(POLICIES if reader.policies else ())]))
 
 
 def reader_of(path: Path) -> Reader:

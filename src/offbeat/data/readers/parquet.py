@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError
 
 _ROWS = 1 << 16  # in memory at a time, beside the result
+_BUFFER = 1 << 18  # bytes of each column in memory at a time
 _INDEX = "__index_level_0__"  # what pandas calls an index without a name
 
 
@@ -61,7 +63,8 @@ def read_parquet(
 
     path = require_file(path)
     try:
-        with pq.ParquetFile(path) as file:
+        # Else a whole row group, which can be all of the file, would lie in memory, too.
+        with pq.ParquetFile(path, pre_buffer=False, buffer_size=_BUFFER) as file:
             schema = file.schema_arrow
             columns = Columns.of(
                 path,
@@ -76,7 +79,8 @@ def read_parquet(
             _check_types(path, schema, columns)
             if not file.metadata.num_rows:
                 raise FileFormatError(f"{path} has columns and no rows, expected one per time")
-            first = next(file.iter_batches(_ROWS, columns=columns.read))
+            batches = file.iter_batches(_ROWS, columns=columns.read)
+            first = next(batches)
             widths = {
                 name: _width(path, name, first.column(name))
                 for name in columns.channels
@@ -91,7 +95,7 @@ def read_parquet(
                 sample = sample.cast(pa.float64(), safe=False).to_numpy()
                 unit, notes = state_time_unit(time_unit, columns.time, sample, str(path))
             table = gather(
-                file.iter_batches(_ROWS, columns=columns.read),
+                itertools.chain([first], batches),
                 columns,
                 file.metadata.num_rows,
                 widths=widths,

@@ -105,7 +105,7 @@ def read_euroc(path: str | Path, *, sensors: Sequence[str] | None = None) -> lis
     if not path.is_dir():
         if sensors is not None:
             raise InputError(f"{path} is the file of one sensor; leave sensors out")
-        [recording] = read_csv(path, trajectory_column=None)
+        [recording] = read_csv(path, time_unit="ns")
         signal = recording.signals[0]
         return [replace(recording, signals=(replace(signal, kinds=_kinds(signal.channels)),))]
     files = {file.parent.name: file for file in _data_files(path)}
