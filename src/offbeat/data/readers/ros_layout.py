@@ -131,10 +131,10 @@ class Layout:
         """(messages,) header stamps in nanoseconds, or None without a header."""
         if row.stamp is None:
             return None
-        seconds: NDArray[np.int64]
-        seconds = _numbers(table, row.stamp[0], self.order + "i4", 1)[:, 0].astype(np.int64)
+        seconds = _numbers(table, row.stamp[0], self.order + "i4", 1)[:, 0]
         nanoseconds = _numbers(table, row.stamp[1], self.order + "u4", 1)[:, 0]
-        return seconds * 1_000_000_000 + nanoseconds
+        stamps: NDArray[np.int64] = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds
+        return stamps
 
     def values(self, table: NDArray[np.uint8], row: Row) -> NDArray[np.float64]:
         """(messages, channels) the numbers, as float64."""
