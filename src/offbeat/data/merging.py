@@ -183,12 +183,8 @@ def cut(
             [(*o, c) for o, c in zip(ordered, columns, strict=True)], len(channels.names)
         )
         owned = values is not ordered[0][1] or values is not piece[0].values
-        infinite = np.isinf(values)
-        if infinite.any():
-            values, owned = _without_infinite(
-                values, infinite, owned, recording, channels, policies, account
-            )
-        del infinite
+        if any(np.isinf(column).any() for column in values.T):
+            values, owned = _without_infinite(values, owned, recording, channels, policies, account)
         disorders = [faults.disorder(signal.stamps) for signal in piece]
         limit = faults.longest_allowed(stamps, policies.max_gap_s)
         cuts = np.zeros(0, dtype=np.int64)
@@ -292,13 +288,13 @@ def _ordered(
 
 def _without_infinite(
     values: NDArray[np.float64],
-    infinite: NDArray[np.bool_],
     owned: bool,
     recording: Recording,
     channels: Channels,
     policies: Policies,
     account: Account,
 ) -> tuple[NDArray[np.float64], bool]:
+    infinite = np.isinf(values)
     if policies.infinite == "refuse":
         row, channel = np.argwhere(infinite)[0]
         raise FileFormatError(

@@ -78,14 +78,15 @@ class Trajectory:
                 f"values{where} are infinite at row {row}, channel {names[channel]!r}; "
                 "use NaN for a cell that is not known"
             )
-        known = ~np.isnan(values)
+        known = np.isnan(values)
+        np.logical_not(known, out=known)
         observed = known if self.observed is None else np.asarray(self.observed)
         if observed.dtype != np.bool_ or observed.shape != values.shape:
             raise InputError(
                 f"observed{where} must be bool of shape {values.shape}, as values has, got "
                 f"{observed.dtype} of shape {observed.shape}"
             )
-        if (observed & ~known).any():
+        if observed is not known and (observed & ~known).any():
             row, channel = np.argwhere(observed & ~known)[0]
             raise InputError(
                 f"observed{where} is True at row {row}, channel {names[channel]!r}, where the "
