@@ -88,6 +88,7 @@ class TestADataSet:
             "observation.state.ankle",
         )  # fmt: skip
         assert [t.rows for t in dataset] == [4, 5]
+        assert [t.rows for t in read(path, columns="observation.state", episodes=1)] == [7]
         assert read(path, actions=False)[0].actions is None
         assert read(path, time_column="timestamp")[0].times[1] == pytest.approx(0.05)
 

@@ -94,11 +94,11 @@ class TestABag:
         _, _, others = poses(write.store, 4, topic="/other")
         path = write(messages + others)
         assert [s.name for s in one(path).signals] == ["/pose", "/other"]
-        (signal,) = one(
-            path, topics=["/pose"], fields=["pose.position.z", "header.frame"][:1]
-        ).signals
+        (signal,) = one(path, topics=["/pose"], fields=["pose.position.z"]).signals
         assert signal.channels == ("pose.position.z",)
         assert signal.values[:, 0].tolist() == numbers[:, 2].tolist()
+        (signal,) = one(path, topics="/other", fields="pose.position.x").signals
+        assert (signal.name, signal.channels) == ("/other", ("pose.position.x",))
         some = one(path, fields=["/pose:pose.position", "pose.orientation.x"])
         assert [s.channels[-1] for s in some.signals] == ["pose.orientation.x"] * 2
         assert [len(s.channels) for s in some.signals] == [4, 1]
@@ -113,6 +113,7 @@ class TestABag:
             path, "unknown field 'twist', expected .*pose.position.x", InputError, fields=["twist"]
         )
         refused(path, "'/q', expected one of: /pose", InputError, fields=["/q:pose"])
+        refused(path, r"topics must be one name or more, got \[\]", InputError, topics=[])
         refused(path, "unknown stamps 'gps'", InputError, stamps="gps")
 
     def test_takes_the_time_of_receipt_where_there_is_no_header_stamp(self, write):

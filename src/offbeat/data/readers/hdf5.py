@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.clock import state_time_unit, time_column_of, to_nanoseconds
+from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, InputError, one_of, require
@@ -78,6 +79,7 @@ def recordings(
         MissingExtraError: `h5py` is not installed.
     """
     require("h5py", "hdf5")
+    keys = names("keys", keys)
     if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
         raise InputError(f"rate_hz must be rows per second, above 0, got {rate_hz}")
     path = Path(path)
@@ -90,19 +92,19 @@ def recordings(
     with _opened(path) as file:
         robomimic = "data" in file and any(map(_EPISODE.fullmatch, file["data"]))
         root = file["data"] if robomimic else file
-        names = sorted(
+        episodes = sorted(
             (name for name in root if _EPISODE.fullmatch(name)),
             key=lambda name: int(name.rpartition("_")[2]),
         )
-        if not names:
+        if not episodes:
             raise FileFormatError(
                 f"{path} is laid out neither like robomimic (data/demo_0/obs) nor like Minari "
                 f"(episode_0/observations); it holds: {', '.join(sorted(file)) or 'nothing'}"
             )
         if mask is not None:
-            names = _masked(file, mask, names, path)
+            episodes = _masked(file, mask, episodes, path)
         rate, notes = _rate(root, path, rate_hz, robomimic=robomimic)
-        for name in names:
+        for name in episodes:
             observations = _observations(root[name], path, robomimic=robomimic)
             yield _episode(
                 root[name], observations, path, notes,
@@ -230,13 +232,13 @@ def _episode(
         stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
     if left:
         notes = (*notes, f"left out: {', '.join(left)}")
-    names = {name: _names(name, values.shape[1]) for name, values in arrays.items()}
+    called = {name: _names(name, values.shape[1]) for name, values in arrays.items()}
     signal = Signal(
         "",
         stamps,
         np.hstack(list(arrays.values())),
-        tuple(channel for channels in names.values() for channel in channels),
-        kinds=tuple(kind for name, channels in names.items() for kind in _kinds(name, channels)),
+        tuple(channel for channels in called.values() for channel in channels),
+        kinds=tuple(kind for name, channels in called.items() for kind in _kinds(name, channels)),
     )
     acted = None
     if actions:
@@ -312,7 +314,7 @@ def _actions(
     """The actions, one per row of the observations; of a space of many, side by side."""
     if "actions" not in episode:
         return None, ("there are no actions",)
-    parts, names = [], []
+    parts, channels = [], []
     for name, dataset in _leaves(episode["actions"], ""):
         _refuse_objects(dataset, path)
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
@@ -320,7 +322,7 @@ def _actions(
         values = np.asarray(dataset[()], dtype=np.float64)
         parts.append(values.reshape(len(values), -1))
         start = f"action.{name}" if name else "action"
-        names += [f"{start}[{i}]" for i in range(parts[-1].shape[1])]
+        channels += [f"{start}[{i}]" for i in range(parts[-1].shape[1])]
     n = len(stamps)
     if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (n, n - 1):
         raise FileFormatError(
@@ -332,4 +334,4 @@ def _actions(
     if len(values) == n - 1 and len(values):
         values = np.vstack([values, values[-1:]])
         notes = ("the last observation has no action of its own; the one before stands there",)
-    return Signal("action", stamps, values, tuple(names)), notes
+    return Signal("action", stamps, values, tuple(channels)), notes

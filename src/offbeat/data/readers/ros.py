@@ -7,15 +7,12 @@ and a few megabytes of messages that wait to be decoded, however large the bag i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from offbeat.data.readers.options import Fields, names
 from offbeat.data.readers.ros_files import Bag, Connection, explained, open_bag
-from offbeat.data.readers.ros_layout import Column, Definitions, Layout, find_layout
+from offbeat.data.readers.ros_topic import Topic
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of, require
@@ -24,7 +21,6 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 
 _MAGIC = (b"#ROSBAG V", b"SQLite format 3\0", b"\x89MCAP0\r\n")
 _WAITING_BYTES = 16 * 2**20  # messages that wait to be decoded
-_LAYOUTS = 64  # remembered per topic and length of message
 
 # Without being asked for, nobody wants a camera's picture, a map or a log text as channels.
 _NOT_BY_DEFAULT = (
@@ -92,6 +88,7 @@ def recordings(
         MissingExtraError: `rosbags` is not installed.
     """
     one_of("stamps", stamps, ("header", "receive"))
+    topics = names("topics", topics)
     require("rosbags", "ros")
     path = Path(path)
     if not path.is_dir():
@@ -99,7 +96,7 @@ def recordings(
     with open_bag(path) as bag:
         notes: list[str] = []
         chosen = _chosen(bag.connections, topics, path, notes)
-        wanted = _Fields(fields, sorted({c.topic for c in chosen}))
+        wanted = Fields(fields, sorted({c.topic for c in chosen}))
         readers = _topic_readers(bag, chosen, wanted, typestore, path, notes, asked=bool(topics))
         _read(bag, chosen, readers, path)
     wanted.check()
@@ -146,249 +143,23 @@ def _chosen(
     return chosen
 
 
-class _Fields:
-    """Which fields are asked for; remembers which of them it met."""
-
-    def __init__(self, fields: Sequence[str] | None, topics: list[str]) -> None:
-        self.patterns: list[tuple[str, str]] | None = None
-        self.met: set[tuple[str, str]] = set()
-        self.available: dict[str, None] = {}
-        if fields is None:
-            return
-        self.patterns = []
-        for text in fields:
-            topic, colon, name = text.rpartition(":")
-            if colon:
-                one_of(f"topic of field {text!r}", topic, topics)
-            self.patterns.append((topic, name))
-
-    def of(self, topic: str) -> Callable[[str], bool] | None:
-        """Whether a channel of this topic is wanted; None where the defaults hold."""
-        patterns = self.patterns
-        if patterns is None:
-            return None
-        mine = [pattern for pattern in patterns if pattern[0] in ("", topic)]
-
-        def wanted(name: str) -> bool:
-            for pattern in mine:
-                field = pattern[1]
-                if name.startswith(field) and name[len(field) : len(field) + 1] in ("", ".", "["):
-                    self.met.add(pattern)
-                    return True
-            return False
-
-        return wanted
-
-    def check(self) -> None:
-        """Raises `InputError` for a field that no message had."""
-        if self.patterns is None:
-            return
-        for pattern in self.patterns:
-            if pattern not in self.met:
-                one_of("field", pattern[1], self.available)
-
-
-@dataclass
-class _Part:
-    """Rows of one signal from one layout, out of one heap of messages."""
-
-    order: NDArray[np.intp]
-    header: NDArray[np.int64] | None
-    received: NDArray[np.int64]
-    values: NDArray[np.float64]
-    columns: tuple[Column, ...]
-
-
-@dataclass
-class _Topic:
-    """A topic while it is read: messages that wait, and what was decoded of those before."""
-
-    name: str
-    kind: str
-    definitions: Definitions
-    cdr: bool
-    fields: _Fields
-    times: list[int] = field(default_factory=list)
-    messages: list[bytes] = field(default_factory=list)
-    parts: dict[str, list[_Part]] = field(default_factory=dict)
-    layouts: dict[int, list[Layout]] = field(default_factory=dict)
-    skipped: dict[str, str] = field(default_factory=dict)
-
-    def decode(self) -> None:
-        """Decodes the messages that wait."""
-        received = np.array(self.times, dtype=np.int64)
-        lengths = np.fromiter(map(len, self.messages), dtype=np.intp, count=len(self.messages))
-        found: dict[str, list[_Part]] = {}
-        for length in np.unique(lengths):
-            where = np.flatnonzero(lengths == length)
-            joined = b"".join([self.messages[i] for i in where])
-            table = np.frombuffer(joined, np.uint8).reshape(len(where), length)
-            known = self.layouts.setdefault(int(length), [])
-            for layout in list(known):
-                fits = layout.fits(table)
-                if fits.any():
-                    self._take(layout, table[fits], where[fits], received, found)
-                    table, where = table[~fits], where[~fits]
-            while len(where):
-                layout = self._layout(self.messages[where[0]])
-                if len(known) < _LAYOUTS:
-                    known.append(layout)
-                fits = layout.fits(table)
-                self._take(layout, table[fits], where[fits], received, found)
-                table, where = table[~fits], where[~fits]
-        for suffix, parts in found.items():
-            self.parts.setdefault(suffix, []).extend(_in_order(parts))
-        self.times, self.messages = [], []
-
-    def _layout(self, message: bytes) -> Layout:
-        try:
-            layout = find_layout(
-                message,
-                self.kind,
-                self.definitions,
-                cdr=self.cdr,
-                wanted=self.fields.of(self.name),
-            )
-        except FileFormatError as error:
-            raise FileFormatError(f"topic {self.name}: {error}") from None
-        for name, why in layout.skipped.items():
-            self.skipped.setdefault(name, why)
-        self.fields.available.update(dict.fromkeys(layout.available))
-        return layout
-
-    def _take(
-        self,
-        layout: Layout,
-        table: NDArray[np.uint8],
-        where: NDArray[np.intp],
-        received: NDArray[np.int64],
-        found: dict[str, list[_Part]],
-    ) -> None:
-        for row in layout.rows:
-            found.setdefault(row.suffix, []).append(
-                _Part(
-                    where,
-                    layout.stamps(table, row),
-                    received[where],
-                    layout.values(table, row),
-                    tuple(row.columns),
-                )
-            )
-
-    @property
-    def has_header(self) -> bool:
-        """Whether every row has a header stamp, and not all of them are 0."""
-        every = [part.header for parts in self.parts.values() for part in parts]
-        return bool(every) and all(
-            stamps is not None and bool((stamps != 0).any()) for stamps in every
-        )
-
-    def span(self, *, header: bool) -> tuple[int, int]:
-        """The first and the last stamp."""
-        every = [
-            stamps
-            for parts in self.parts.values()
-            for part in parts
-            if (stamps := part.header if header else part.received) is not None
-        ]
-        return min(int(s.min()) for s in every), max(int(s.max()) for s in every)
-
-    def signals(self, *, header: bool, notes: list[str]) -> Iterator[Signal]:
-        """The signals; what was decoded is given up on the way, to save memory."""
-        if self.skipped:
-            notes.append(
-                f"{self.name}: left out "
-                + ", ".join(f"{name} ({why})" for name, why in self.skipped.items())
-            )
-        if not self.parts and not self.messages:
-            notes.append(f"{self.name} ({self.kind}) holds no numbers that are asked for")
-        for suffix in list(self.parts):
-            parts = self.parts.pop(suffix)
-            columns = {c.name: c for part in parts for c in part.columns}
-            rows = sum(len(part.order) for part in parts)
-            stamps = np.empty(rows, dtype=np.int64)
-            values = np.empty((rows, len(columns)), order="F")
-            place = {name: i for i, name in enumerate(columns)}
-            first = 0
-            for part in parts:
-                last = first + len(part.order)
-                taken = part.header if header else part.received
-                assert taken is not None  # of `has_header`
-                stamps[first:last] = taken
-                if len(part.columns) < len(columns):
-                    values[first:last] = np.nan
-                order = [place[c.name] for c in part.columns]
-                values[first:last, order] = part.values
-                part.values = np.empty((0, 0))
-                first = last
-            yield Signal(
-                f"{self.name}/{suffix}" if suffix else self.name,
-                stamps,
-                values,
-                tuple(columns),
-                tuple(c.unit for c in columns.values()),
-                _kinds(list(columns.values())),
-            )
-
-
-def _in_order(parts: list[_Part]) -> list[_Part]:
-    """The rows of a heap of messages as they were logged, whatever layouts took turns."""
-    if len(parts) == 1:
-        return parts
-    order = np.concatenate([part.order for part in parts])
-    if (np.diff(order) >= 0).all():
-        return parts
-    columns = {c.name: c for part in parts for c in part.columns}
-    place = {name: i for i, name in enumerate(columns)}
-    values = np.full((len(order), len(columns)), np.nan)
-    first = 0
-    for part in parts:
-        last = first + len(part.order)
-        values[first:last, [place[c.name] for c in part.columns]] = part.values
-        first = last
-    headers = [part.header for part in parts if part.header is not None]
-    header = np.concatenate(headers) if len(headers) == len(parts) else None
-    received = np.concatenate([part.received for part in parts])
-    by = np.argsort(order, kind="stable")
-    return [
-        _Part(
-            order[by],
-            None if header is None else header[by],
-            received[by],
-            values[by],
-            tuple(columns.values()),
-        )
-    ]
-
-
-def _kinds(columns: list[Column]) -> tuple[str, ...]:
-    """Kinds of the channels; a quaternion of which a part was not asked for is none."""
-    kinds = [c.kind for c in columns]
-    for i, column in enumerate(columns):
-        whole = [f"{column.name[:-1]}{axis}" for axis in "xyzw"]
-        start = i - "xyzw".find(column.name[-1])
-        if column.kind == "quaternion" and [c.name for c in columns[start : start + 4]] != whole:
-            kinds[i] = ""
-    return tuple(kinds)
-
-
 def _topic_readers(
     bag: Bag,
     chosen: list[Connection],
-    fields: _Fields,
+    fields: Fields,
     typestore: str,
     path: Path,
     notes: list[str],
     *,
     asked: bool,
-) -> dict[str, _Topic]:
+) -> dict[str, Topic]:
     """A reader per topic that is to be read and whose messages are defined."""
     from rosbags.typesys import Stores, get_typestore
 
     stores = {store.value: store for store in Stores if store.value.startswith(("ros2", "latest"))}
     one_of("typestore", typestore, stores)
     base = dict(get_typestore(Stores.EMPTY).fielddefs)
-    readers: dict[str, _Topic] = {}
+    readers: dict[str, Topic] = {}
     assumed: list[str] = []
     for connection in chosen:
         name, kind = connection.topic, connection.kind
@@ -422,7 +193,7 @@ def _topic_readers(
                     f"bag nor in the typestore {typestore!r}; name the distribution that has it "
                     f"with typestore=, one of: {', '.join(sorted(stores))}"
                 )
-        readers[name] = _Topic(name, kind, definitions, bag.cdr, fields)
+        readers[name] = Topic(name, kind, definitions, bag.cdr, fields)
     if assumed:
         notes.append(
             f"the bag does not define the messages of {', '.join(assumed)}; the definitions of "
@@ -431,7 +202,7 @@ def _topic_readers(
     return readers
 
 
-def _read(bag: Bag, chosen: list[Connection], readers: dict[str, _Topic], path: Path) -> None:
+def _read(bag: Bag, chosen: list[Connection], readers: dict[str, Topic], path: Path) -> None:
     """Hands every message of the chosen topics to its reader, a heap at a time."""
     heaps = {c.id: readers[c.topic] for c in chosen if c.topic in readers}
     waiting = 0
@@ -453,7 +224,7 @@ def _read(bag: Bag, chosen: list[Connection], readers: dict[str, _Topic], path: 
         raise FileFormatError(f"{path}: {error}") from None
 
 
-def _clocks(topics: list[_Topic], stamps: str, notes: list[str]) -> dict[str, bool]:
+def _clocks(topics: list[Topic], stamps: str, notes: list[str]) -> dict[str, bool]:
     """Whether each topic takes the stamps of its headers.
 
     Topics without a header have the time of receipt alone. Where that clock and the one of the

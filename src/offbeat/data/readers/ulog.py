@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.readers.options import Fields, below, names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of, require
@@ -93,7 +94,8 @@ def recordings(
     """
     require("pyulog", "px4")
     path = require_file(path)
-    asked = dict(_instance(topic) for topic in topics) if topics is not None else None
+    listed = names("topics", topics)
+    asked = None if listed is None else dict(_instance(topic) for topic in listed)
     wanted = _Wanted(DEFAULTS if asked is None else asked)
     log, notes = _parsed(path, wanted)
     there: dict[str, list[Any]] = {}
@@ -119,12 +121,12 @@ def recordings(
                 one_of(f"instance of {name}", str(instance), _instances(there.get(name, [])))
             if not chosen[name]:
                 raise FileFormatError(f"{path}: nothing was logged to topic {name}; leave it out")
-    pick = _Fields(fields, asked, chosen)
+    pick = Fields(fields, chosen)
     signals = [
         signal
-        for name, instances in chosen.items()
+        for instances in chosen.values()
         for data in instances
-        if (signal := _signal(data, pick.of(name, data), notes)) is not None
+        if (signal := _signal(data, _fields(data, pick, asked=bool(asked)), notes)) is not None
     ]
     pick.check()
     if not signals:
@@ -210,53 +212,16 @@ def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
     return log, notes
 
 
-class _Fields:
-    """Which fields of a topic are taken."""
-
-    def __init__(
-        self,
-        fields: Sequence[str] | None,
-        asked: dict[str, int | None] | None,
-        chosen: dict[str, list[Any]],
-    ) -> None:
-        self.asked = asked
-        self.patterns: list[tuple[str, str]] | None = None
-        self.met: set[tuple[str, str]] = set()
-        self.known: dict[str, None] = {}
-        if fields is None:
-            return
-        self.patterns = []
-        for text in fields:
-            topic, colon, name = text.rpartition(":")
-            if colon:
-                one_of(f"topic of field {text!r}", topic, chosen)
-            self.patterns.append((topic, name))
-
-    def of(self, topic: str, data: Any) -> list[str]:
-        """The names of the fields to take, in the order of the log."""
-        numbers = [f.field_name for f in data.field_data if f.type_str != "char"]
-        self.known.update(dict.fromkeys(name.partition("[")[0] for name in numbers))
-        if self.patterns is not None:
-            taken = []
-            for name in numbers:
-                met = [p for p in self.patterns if p[0] in ("", topic) and _below(name, p[1])]
-                self.met.update(met)
-                if met:
-                    taken.append(name)
-            return taken
-        if self.asked is None:
-            return [n for n in numbers if any(_below(n, field) for field in DEFAULTS[topic])]
-        return [n for n in numbers if "timestamp" not in n and "_padding" not in n]
-
-    def check(self) -> None:
-        """Raises `InputError` for a field that no topic has."""
-        for pattern in self.patterns or ():
-            if pattern not in self.met:
-                one_of("field", pattern[1], self.known)
-
-
-def _below(name: str, field: str) -> bool:
-    return name.startswith(field) and name[len(field) : len(field) + 1] in ("", "[", ".")
+def _fields(data: Any, fields: Fields, *, asked: bool) -> list[str]:
+    """The names of the fields of a topic that are taken, in the order of the log."""
+    numbers = [f.field_name for f in data.field_data if f.type_str != "char"]
+    fields.available.update(dict.fromkeys(name.partition("[")[0] for name in numbers))
+    wanted = fields.of(data.name)
+    if wanted is not None:
+        return [name for name in numbers if wanted(name)]
+    if not asked:
+        return [n for n in numbers if any(below(n, path) for path in DEFAULTS[data.name])]
+    return [n for n in numbers if "timestamp" not in n and "_padding" not in n]
 
 
 def _signal(data: Any, names: list[str], notes: list[str]) -> Signal | None:

@@ -1,0 +1,213 @@
+"""One topic of a ROS bag, from serialised messages to signals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.readers.options import Fields
+from offbeat.data.readers.ros_layout import Column, Definitions, Layout, find_layout
+from offbeat.data.signals import Signal
+from offbeat.errors import FileFormatError
+
+_LAYOUTS = 64  # remembered per topic and length of message
+
+
+@dataclass
+class _Part:
+    """Rows of one signal from one layout, out of one heap of messages."""
+
+    order: NDArray[np.intp]
+    header: NDArray[np.int64] | None
+    received: NDArray[np.int64]
+    values: NDArray[np.float64]
+    columns: tuple[Column, ...]
+
+
+@dataclass
+class Topic:
+    """A topic while it is read: messages that wait, and what was decoded of those before.
+
+    Args:
+        name: of the topic.
+        kind: type of its messages.
+        definitions: fields of that type and of those that it holds.
+        cdr: serialised by ROS 2; else by ROS 1.
+        fields: which fields are asked for.
+        times: times of receipt of the messages that wait, in nanoseconds.
+        messages: the messages that wait.
+        parts: what was decoded, by the suffix of its signal.
+        layouts: layouts that were found, by the length of their messages.
+        skipped: fields that are left out, each with the reason.
+    """
+
+    name: str
+    kind: str
+    definitions: Definitions
+    cdr: bool
+    fields: Fields
+    times: list[int] = field(default_factory=list)
+    messages: list[bytes] = field(default_factory=list)
+    parts: dict[str, list[_Part]] = field(default_factory=dict)
+    layouts: dict[int, list[Layout]] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    def decode(self) -> None:
+        """Decodes the messages that wait."""
+        received = np.array(self.times, dtype=np.int64)
+        lengths = np.fromiter(map(len, self.messages), dtype=np.intp, count=len(self.messages))
+        found: dict[str, list[_Part]] = {}
+        for length in np.unique(lengths):
+            where = np.flatnonzero(lengths == length)
+            joined = b"".join([self.messages[i] for i in where])
+            table = np.frombuffer(joined, np.uint8).reshape(len(where), length)
+            known = self.layouts.setdefault(int(length), [])
+            for layout in list(known):
+                fits = layout.fits(table)
+                if fits.any():
+                    self._take(layout, table[fits], where[fits], received, found)
+                    table, where = table[~fits], where[~fits]
+            while len(where):
+                layout = self._layout(self.messages[where[0]])
+                if len(known) < _LAYOUTS:
+                    known.append(layout)
+                fits = layout.fits(table)
+                self._take(layout, table[fits], where[fits], received, found)
+                table, where = table[~fits], where[~fits]
+        for suffix, parts in found.items():
+            self.parts.setdefault(suffix, []).extend(_in_order(parts))
+        self.times, self.messages = [], []
+
+    def _layout(self, message: bytes) -> Layout:
+        try:
+            layout = find_layout(
+                message,
+                self.kind,
+                self.definitions,
+                cdr=self.cdr,
+                wanted=self.fields.of(self.name),
+            )
+        except FileFormatError as error:
+            raise FileFormatError(f"topic {self.name}: {error}") from None
+        for name, why in layout.skipped.items():
+            self.skipped.setdefault(name, why)
+        self.fields.available.update(dict.fromkeys(layout.available))
+        return layout
+
+    def _take(
+        self,
+        layout: Layout,
+        table: NDArray[np.uint8],
+        where: NDArray[np.intp],
+        received: NDArray[np.int64],
+        found: dict[str, list[_Part]],
+    ) -> None:
+        for row in layout.rows:
+            found.setdefault(row.suffix, []).append(
+                _Part(
+                    where,
+                    layout.stamps(table, row),
+                    received[where],
+                    layout.values(table, row),
+                    tuple(row.columns),
+                )
+            )
+
+    @property
+    def has_header(self) -> bool:
+        """Whether every row has a header stamp, and not all of them are 0."""
+        every = [part.header for parts in self.parts.values() for part in parts]
+        return bool(every) and all(
+            stamps is not None and bool((stamps != 0).any()) for stamps in every
+        )
+
+    def span(self, *, header: bool) -> tuple[int, int]:
+        """The first and the last stamp."""
+        every = [
+            stamps
+            for parts in self.parts.values()
+            for part in parts
+            if (stamps := part.header if header else part.received) is not None
+        ]
+        return min(int(s.min()) for s in every), max(int(s.max()) for s in every)
+
+    def signals(self, *, header: bool, notes: list[str]) -> Iterator[Signal]:
+        """The signals; what was decoded is given up on the way, to save memory."""
+        if self.skipped:
+            notes.append(
+                f"{self.name}: left out "
+                + ", ".join(f"{name} ({why})" for name, why in self.skipped.items())
+            )
+        if not self.parts and not self.messages:
+            notes.append(f"{self.name} ({self.kind}) holds no numbers that are asked for")
+        for suffix in list(self.parts):
+            parts = self.parts.pop(suffix)
+            columns = {c.name: c for part in parts for c in part.columns}
+            rows = sum(len(part.order) for part in parts)
+            stamps = np.empty(rows, dtype=np.int64)
+            values = np.empty((rows, len(columns)), order="F")
+            place = {name: i for i, name in enumerate(columns)}
+            first = 0
+            for part in parts:
+                last = first + len(part.order)
+                taken = part.header if header else part.received
+                assert taken is not None  # of `has_header`
+                stamps[first:last] = taken
+                if len(part.columns) < len(columns):
+                    values[first:last] = np.nan
+                order = [place[c.name] for c in part.columns]
+                values[first:last, order] = part.values
+                part.values = np.empty((0, 0))
+                first = last
+            yield Signal(
+                f"{self.name}/{suffix}" if suffix else self.name,
+                stamps,
+                values,
+                tuple(columns),
+                tuple(c.unit for c in columns.values()),
+                _kinds(list(columns.values())),
+            )
+
+
+def _in_order(parts: list[_Part]) -> list[_Part]:
+    """The rows of a heap of messages as they were logged, whatever layouts took turns."""
+    if len(parts) == 1:
+        return parts
+    order = np.concatenate([part.order for part in parts])
+    if (np.diff(order) >= 0).all():
+        return parts
+    columns = {c.name: c for part in parts for c in part.columns}
+    place = {name: i for i, name in enumerate(columns)}
+    values = np.full((len(order), len(columns)), np.nan)
+    first = 0
+    for part in parts:
+        last = first + len(part.order)
+        values[first:last, [place[c.name] for c in part.columns]] = part.values
+        first = last
+    headers = [part.header for part in parts if part.header is not None]
+    header = np.concatenate(headers) if len(headers) == len(parts) else None
+    received = np.concatenate([part.received for part in parts])
+    by = np.argsort(order, kind="stable")
+    return [
+        _Part(
+            order[by],
+            None if header is None else header[by],
+            received[by],
+            values[by],
+            tuple(columns.values()),
+        )
+    ]
+
+
+def _kinds(columns: list[Column]) -> tuple[str, ...]:
+    """Kinds of the channels; a quaternion of which a part was not asked for is none."""
+    kinds = [c.kind for c in columns]
+    for i, column in enumerate(columns):
+        whole = [f"{column.name[:-1]}{axis}" for axis in "xyzw"]
+        start = i - "xyzw".find(column.name[-1])
+        if column.kind == "quaternion" and [c.name for c in columns[start : start + 4]] != whole:
+            kinds[i] = ""
+    return tuple(kinds)

@@ -1,0 +1,135 @@
+"""One walk in every format that the project reads: what writes it, for the tests of readers.
+
+A format of a new reader needs an entry here, or in `SAME_WALK` of `robot_logs`; the contract suite
+then covers it without a new test.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from offbeat.data.store import save
+from offbeat.data.trajectory import Dataset, Trajectory
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def shared(*parts):
+    """A real log, out of OFFBEAT_DATA or the folder beside the repository; skips without it."""
+    root = Path(os.environ.get("OFFBEAT_DATA") or ROOT.parent / "shared" / "data")
+    path = root.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"{path} is not here")
+    return path
+
+
+def evo(*parts):
+    """A file of the unpacked source of the package evo, at OFFBEAT_EVO; skips without it."""
+    root = os.environ.get("OFFBEAT_EVO")
+    found = [Path(root)] if root else sorted((ROOT.parent / "shared" / "data").glob("evo-*"))
+    path = found[0].joinpath("test", *parts) if found else None
+    if path is None or not path.exists():
+        pytest.skip("the source of the package evo is not here, set OFFBEAT_EVO to its folder")
+    return path
+
+
+def text_of(value):
+    """A cell of CSV: empty where nothing is known."""
+    return "" if np.isnan(value) else repr(float(value))
+
+
+def write_csv(path, stamps, values):
+    with path.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time_ns", "hip", "knee"])
+        writer.writerows([t, *map(text_of, row)] for t, row in zip(stamps, values, strict=True))
+    return path.with_suffix(".csv")
+
+
+def write_long_csv(path, stamps, values):
+    with path.with_suffix(".tsv").open("w", newline="") as file:
+        writer = csv.writer(file, delimiter="\t")
+        writer.writerow(["t [ns]", "channel", "value"])
+        for t, row in zip(stamps, values, strict=True):
+            writer.writerows(
+                [t, name, text_of(x)] for name, x in zip(("hip", "knee"), row, strict=True)
+            )
+    return path.with_suffix(".tsv")
+
+
+def write_parquet(path, stamps, values):
+    columns = {"timestamp": pa.array(stamps, pa.timestamp("ns")), "hip": values[:, 0]}
+    pq.write_table(pa.table(columns | {"knee": values[:, 1]}), path.with_suffix(".parquet"))
+    return path.with_suffix(".parquet")
+
+
+def write_long_parquet(path, stamps, values):
+    names = pa.array(["hip", "knee"] * len(stamps)).dictionary_encode()
+    columns = {"time_ns": np.repeat(stamps, 2), "sensor": names, "value": values.ravel()}
+    pq.write_table(pa.table(columns), path.with_suffix(".pq"))
+    return path.with_suffix(".pq")
+
+
+def write_npz(path, stamps, values):
+    np.savez(path.with_suffix(".npz"), time_ns=stamps, joints=values, names=["hip", "knee"])
+    return path.with_suffix(".npz")
+
+
+def write_tum(path, stamps, values):
+    """Poses whose first two coordinates are the walk."""
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for t, (x, y) in zip(stamps, values, strict=True):
+        lines.append(f"{t // 10**9}.{t % 10**9:09d} {float(x)!r} {float(y)!r} 0 0 0 0 1")
+    path.with_suffix(".tum").write_text("\n".join(lines) + "\n")
+    return path.with_suffix(".tum")
+
+
+def write_euroc_file(path, stamps, values):
+    header = "#timestamp [ns],hip [rad],knee [rad]"
+    rows = (f"{t},{x!r},{y!r}" for t, (x, y) in zip(stamps, values.tolist(), strict=True))
+    path.with_suffix(".csv").write_text("\n".join([header, *rows]) + "\n")
+    return path.with_suffix(".csv")
+
+
+def write_euroc_folder(path, stamps, values):
+    (path / "mav0" / "imu0").mkdir(parents=True)
+    write_euroc_file(path / "mav0" / "imu0" / "data", stamps, values)
+    return path
+
+
+def write_own(path, stamps, values):
+    times = (np.asarray(stamps) - stamps[0]) / 1e9
+    save(Dataset([Trajectory(times, values, names=("hip", "knee"))]), path.with_suffix(".parquet"))
+    return path.with_suffix(".parquet")
+
+
+WRITERS = {
+    "offbeat": write_own,
+    "csv": write_csv,
+    "csv long": write_long_csv,
+    "parquet": write_parquet,
+    "parquet long": write_long_parquet,
+    "npz": write_npz,
+    "tum": write_tum,
+    "euroc": write_euroc_file,
+    "euroc folder": write_euroc_folder,
+}
+"""By name of the reader and variant: writes stamps (n,), nanoseconds, and values (n, 2)."""
+
+OPTIONS = {}
+"""Options that a variant needs to be read."""
+
+try:
+    import robot_logs
+except ImportError:
+    pass
+else:
+    WRITERS |= robot_logs.SAME_WALK
+    OPTIONS |= robot_logs.SAME_WALK_OPTIONS
