@@ -57,7 +57,14 @@ def advise(
     options: dict[str, Any] = dict(reader or {})
     reasons: list[str] = []
     useful = [channel for channel in inspection.channels if channel.cells and not channel.constant]
-    useless = [channel.name for channel in inspection.channels if channel not in useful]
+    # A quaternion is mended whole or not at all: its resting parts stay.
+    fours = inspection.report.get("quaternions", {}).get("channels", ())
+    turned = {name for four in fours for name in four}
+    useless = [
+        channel.name
+        for channel in inspection.channels
+        if channel not in useful and channel.name not in turned
+    ]
     if useless and useful and "without" in known:
         options["without"] = [*options.get("without", ()), *useless]
         reasons.append(

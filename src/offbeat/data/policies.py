@@ -220,9 +220,11 @@ def sentences(report: Mapping[str, Any]) -> list[str]:
         said.append(f"the clock was set {jumps['found']} times; {what}")
     outages = report["outages"]
     if outages["found"]:
+        count, longest = outages["found"], f"{outages['longest_s']:.3g} s"
+        what = f"{count} outages, the longest of {longest}, each" if count > 1 else ""
         said.append(
-            f"{outages['found']} outages, the longest of {outages['longest_s']:.3g} s, each began "
-            f"a new episode (max_gap_s {outages['max_gap_s']})"
+            f"{what or f'1 outage of {longest}'} began a new episode "
+            f"(max_gap_s {outages['max_gap_s']})"
         )
     left = report["left_out"]
     if left["episodes"]:

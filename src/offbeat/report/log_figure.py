@@ -274,7 +274,7 @@ def _legend(figure: Figure, lanes: list[_Lane], outages: bool) -> None:
     shown.append(Line2D([], [], color=_GAP, linewidth=0.9, label="a long gap begins"))
     if outages:
         shown.append(Patch(color=_GAP, alpha=0.18, label="outage, between episodes"))
-    figure.legend(handles=shown, loc="outside lower center", ncols=len(shown), fontsize=8)
+    figure.legend(handles=shown, loc="outside lower center", ncols=min(len(shown), 4), fontsize=8)
 
 
 def _rgb(colour: str) -> tuple[float, float, float]:

@@ -126,7 +126,8 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise FileFormatError(f"{path} holds one array, expected an NPZ with several")
-            return {name: file[name] for name in file.files}
+            with file:
+                return {name: file[name] for name in file.files}
     except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError) as error:
         if isinstance(error, FileFormatError):
             raise

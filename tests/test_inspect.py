@@ -1,0 +1,109 @@
+"""`offbeat inspect`: rates, gaps, held values and faults of a log whose faults are known."""
+
+from __future__ import annotations
+
+import json
+import shlex
+
+import numpy as np
+import pytest
+from PIL import Image
+from robot_logs import shared
+
+from offbeat.cli import main
+from offbeat.data.advice import advise
+from offbeat.data.inspection import inspect
+from offbeat.data.readers import read
+
+ROWS = 400
+
+
+@pytest.fixture
+def faulty(tmp_path):
+    """10 ms apart in microseconds since 1970; an outage of 12 s before row 200."""
+    stamps = (
+        1_700_000_000_000_000 + 10_000 * np.arange(ROWS) + 12_000_000 * (np.arange(ROWS) >= 200)
+    )
+    turn = 0.05 * np.arange(ROWS)
+    half, sign = 0.01 * np.arange(ROWS), np.where((np.arange(ROWS) // 50) % 2, -1, 1)
+    lines = ["time,arm [m],yaw [rad],temp,qw,qx,qy,qz,broken"]
+    for i in range(ROWS):
+        arm = "" if i % 10 == 3 else f"{np.sin(0.1 * i):.6f}"
+        yaw = (turn[i] + np.pi) % (2 * np.pi) - np.pi
+        quaternion = f"{sign[i] * np.cos(half[i]):.9f},0,0,{sign[i] * np.sin(half[i]):.9f}"
+        lines.append(f"{stamps[i]},{arm},{yaw:.6f},{20 + (i // 4) % 7},{quaternion},")
+    lines[51], lines[52] = lines[52], lines[51]
+    lines.insert(81, lines[80])
+    path = tmp_path / "faulty.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_every_fault_that_was_put_in_is_found_and_said(faulty):
+    found = inspect(read(faulty, angles=["yaw"]))
+    channels = {channel.name: channel for channel in found.channels}
+    assert (found.format, found.time_unit, found.rows, len(found.episodes)) == (
+        "csv",
+        "us",
+        ROWS,
+        2,
+    )
+    assert found.rate_hz == pytest.approx(100)
+    assert channels["arm"].missing == pytest.approx(0.1)
+    assert channels["arm"].longest_gap_s == pytest.approx(0.02)
+    assert channels["arm"].unit == "m"
+    assert (channels["temp"].rows_per_value, channels["arm"].rows_per_value) == (4, 0)
+    assert (channels["broken"].cells, channels["broken"].rate_hz) == (0, None)
+    assert channels["qx"].constant
+    assert channels["yaw"].high > 9  # 10 rad per episode, from within half a turn on
+    first, second = found.episodes
+    assert (first.late, first.duplicates, first.outage_before_s) == (1, 1, None)
+    assert second.outage_before_s == pytest.approx(12.01)
+    said = " ".join(found.found)
+    for words in (
+        "taken to be in us", "1 row came late", "1 row had the stamp", "1 outage of 12 s began",
+        "held values", "jumps by a turn were taken out of yaw", "200 rows changed sign",
+    ):  # fmt: skip
+        assert words in said
+
+
+def test_the_advice_masks_what_is_held_and_keeps_a_quaternion_whole(faulty):
+    command = advise(inspect(read(faulty)), "faulty.csv").command
+    assert "--reader.without=[broken]" in command
+    assert "--reader.held=mask" in command
+
+
+def test_the_command_of_the_advice_trains(faulty, tmp_path, capsys):
+    assert main(["inspect", str(faulty), "--run", str(tmp_path / "run"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    small = ["--model.name=gru", "--model.hidden_size=4", "--training.epochs=1"]
+    assert main([*told["advice"]["command"][1:], *small]) == 0
+    kept = json.loads((tmp_path / "run" / "reader.json").read_text())
+    assert kept == {"without": ["broken"], "held": "mask"}
+    predictions = tmp_path / "predictions.csv"
+    assert main(["predict", str(tmp_path / "run"), str(faulty), str(predictions)]) == 0
+    assert "broken" not in predictions.read_text().splitlines()[0]
+
+
+def test_text_ends_in_advice_and_the_picture_shows_the_outage_as_white(faulty, tmp_path, capsys):
+    picture = tmp_path / "log.png"
+    assert main(["inspect", str(faulty), "--out", str(picture), "--reader.max_gap_s=null"]) == 0
+    text = capsys.readouterr().out
+    assert shlex.join(["offbeat", "train", str(faulty)]) in text
+    pixels = np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3)
+    blue = np.abs(pixels.astype(int) - (0, 114, 178)).max(axis=1) < 8
+    assert 0 < blue.mean() < 0.25  # 4 s of 16 s are measured
+
+
+def test_an_option_that_the_format_does_not_have_is_refused_in_one_line(faulty, capsys):
+    assert main(["inspect", str(faulty), "--reader.max_gap=1"]) == 2
+    assert "did you mean 'max_gap_s'" in capsys.readouterr().err
+
+
+def test_a_real_flight_log_shows_its_streams_gaps_and_dropouts():
+    found = inspect(read(shared("px4_ulog", "sample.ulg")))
+    rates = {channel.name: channel.rate_hz for channel in found.channels}
+    assert rates["sensor_combined.gyro_rad[0]"] == pytest.approx(250, rel=0.01)
+    assert rates["vehicle_attitude.q[0]"] == pytest.approx(83, rel=0.02)
+    assert rates["vehicle_local_position.z"] == pytest.approx(10, rel=0.01)
+    assert any("4 dropouts" in said for said in found.found)
