@@ -2,8 +2,9 @@
 
     OFFBEAT_DATA=FOLDER python examples/real_px4.py --out results/real_logs --figures docs/figures
 
-The log is `px4_ulog/sample.ulg` (69 s, of pyulog's test logs). Its board is moved by hand in 2 to 6.2 and lies still for the rest, in which nothing but noise could be tested. So the
-moving part is split in time by itself, and a stretch of the still part is tested on its own. The
+The log is `px4_ulog/sample.ulg` (69 s, one of pyulog's). Its board is moved by hand from 2 s to
+6.2 s and lies still for the rest, where nothing but noise can be tested. So the moving part is
+split in time by itself, and a stretch of the still part is trained on, and tested on its own. The
 actuator outputs are constant in this log and are left out.
 """
 
