@@ -48,7 +48,7 @@ def px4(small: bool) -> Log:
             "still": ob.Dataset((between(log, 20, 22),)),
         },
         window=150,
-        windows=3 if small else 12,
+        windows=3 if small else 48,
         sensors=(sum(IMU.values(), ()), sum(ATTITUDE.values(), ())),
         silence_s=0.1,
         horizons_s=(0.1, 0.2, 0.5, 1.0),
