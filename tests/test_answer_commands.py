@@ -196,6 +196,16 @@ def test_a_figure_shows_observed_cells_hidden_truth_and_every_answer():
     assert axes.get_ylabel() == "a (m)"
 
 
+def test_a_long_name_stands_above_its_panel_where_it_runs_into_no_other():
+    short, long = "q[0]", "sensor_combined.accelerometer_m_s2[0]"
+    truth = ob.Trajectory(
+        [0.0, 1.0], [[3.0, 1.0], [4.0, 2.0]], names=(short, long), units=("", "m/s^2")
+    )
+    first, second = answers(truth, {}, [short, long]).axes
+    assert (first.get_ylabel(), first.get_title(loc="left")) == (short, "")
+    assert (second.get_ylabel(), second.get_title(loc="left")) == ("", f"{long} (m/s^2)")
+
+
 def test_a_forecast_begins_at_the_last_observation():
     truth = ob.Trajectory([0.0, 1.0], [[3.0], [4.0]], names=("a",))
     ahead = ob.Trajectory([2.0], [[6.0]], observed=np.zeros((1, 1), bool), names=("a",))

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+LONGEST_LABEL = 24
+"""Characters of a channel's name and unit that fit beside a panel; longer ones stand above it."""
+
 
 def answers(
     truth: Trajectory,
@@ -104,7 +107,11 @@ def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], 
         zorder=4,
     )
     unit = truth.units[channel]
-    axes.set_ylabel(f"{name} ({unit})" if unit else name)
+    label = f"{name} ({unit})" if unit else name
+    if len(label) <= LONGEST_LABEL:
+        axes.set_ylabel(label)
+    else:  # a topic's field, say: written along the axis it would run into the next panel
+        axes.set_title(label, loc="left", fontsize=8.5)
     axes.margins(x=0.01)
     together = np.concatenate(drawn)
     together = together[np.isfinite(together)]
