@@ -1,12 +1,14 @@
 """The record of a reproduction is read, checked and asked; what stands beside it is told."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 import record_helpers as made
 
 from offbeat.errors import FileFormatError, InputError
+from offbeat.experiment.protocol import Protocol
 from offbeat.report import circumstances
 from offbeat.report.circumstances import Circumstances
 from offbeat.report.records import Record, read_record
@@ -196,3 +198,15 @@ def test_a_damaged_file_beside_the_record_is_left_out(tmp_path, text):
 )
 def test_times_are_said_as_people_say_them(seconds, said):
     assert circumstances.hours(seconds) == said
+
+
+def test_another_protocol_than_the_thesis_is_told_with_what_differs():
+    def told(protocol):
+        return Circumstances(json.loads(json.dumps(asdict(protocol)))).departures
+
+    assert told(Protocol()) == ()
+    assert Circumstances().departures == ()
+    (said,) = told(Protocol.tiny())
+    assert said.startswith("This is not the thesis' protocol")
+    assert "repeats 3 in place of 10" in said
+    assert "hidden_size" not in said

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from offbeat.experiment.protocol import Protocol
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.records import PROVENANCE, Record
 from offbeat.report.tables import label, percent
@@ -77,6 +78,22 @@ class Circumstances:
         """Of experiment 2 in the full protocol."""
         said = self.protocol.get("repeats")
         return said if isinstance(said, int) and said >= 1 else thesis.REPEATS
+
+    @property
+    def departures(self) -> tuple[str, ...]:
+        """A sentence on what the protocol has other than the thesis'; empty where nothing."""
+        wanted = json.loads(json.dumps(asdict(Protocol())))
+        other = [
+            f"{name} {self.protocol[name]} in place of {value}"
+            for name, value in wanted.items()
+            if name in self.protocol and self.protocol[name] != value
+        ]
+        if not other:
+            return ()
+        return (
+            "This is not the thesis' protocol, and its numbers are not to be compared with the "
+            f"thesis': {'; '.join(other)}.",
+        )
 
 
 def _json(path: Path) -> Any:

@@ -227,7 +227,11 @@ class Contents:
     @property
     def faults(self) -> tuple[str, ...]:
         """What makes numbers hard to compare, a sentence each."""
-        return (*mixing(self.record), *broken_pairs(self.record))
+        return (
+            *self.circumstances.departures,
+            *mixing(self.record),
+            *broken_pairs(self.record),
+        )
 
 
 _FAMILY_TABLES = (

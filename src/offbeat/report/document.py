@@ -156,6 +156,11 @@ def _method(contents: Contents) -> tuple[str, str, str]:
         "<h3>Scorings</h3>",
         page.facts(_SCORINGS),
         "<h3>Commands</h3>",
+        ""
+        if contents.circumstances.commands
+        else page.paragraph(
+            "The folder of the record does not hold what was typed; the full protocol is run by:"
+        ),
         page.commands((*(contents.circumstances.commands or (_REPRODUCE,)), _REPORT)),
         "<h3>Time</h3>",
         page.facts(time_facts(record, contents.circumstances)),
