@@ -54,6 +54,11 @@ def data_files(path):
     return sorted(files, key=lambda file: -file.stat().st_size)
 
 
+def by_name(variant, log):
+    """Names the format of a folder, whose content no longer tells it."""
+    return {} if log.is_file() else {"format": variant.split()[0]}
+
+
 def one_line(error):
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 700
@@ -161,13 +166,12 @@ def test_a_channel_can_be_left_out(variant, log):
 
 
 def test_a_git_lfs_pointer_is_called_one(variant, log):
-    for file in data_files(log):
-        file.write_bytes(
-            b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 9\n"
-        )
-    with pytest.raises(FileFormatError, match=r"Git LFS pointer, .* git lfs pull") as e:
-        read_back(variant, log, **({} if log.is_file() else {"format": variant.split()[0]}))
-    one_line(e)
+    data_files(log)[0].write_bytes(
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 9\n"
+    )
+    with pytest.raises(FileFormatError, match=r"Git LFS pointer, .* git lfs pull") as error:
+        read_back(variant, log, **by_name(variant, log))
+    one_line(error)
 
 
 def test_pickled_content_is_refused_and_never_loaded(variant, log, tmp_path):
@@ -178,7 +182,7 @@ def test_pickled_content_is_refused_and_never_loaded(variant, log, tmp_path):
     for file in data_files(log):
         file.write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(FileFormatError, match="pickled") as error:
-        read_back(variant, log, **({} if log.is_file() else {"format": variant.split()[0]}))
+        read_back(variant, log, **by_name(variant, log))
     one_line(error)
     assert not (tmp_path / "loaded").exists()
 
@@ -205,14 +209,12 @@ def test_a_truncated_file_is_an_error_of_one_line_or_reads_up_to_the_cut(variant
 
 
 def test_a_missing_and_an_empty_file_are_errors_of_one_line(variant, log):
-    suffix = log.suffix
     with pytest.raises(FileFormatError, match="No such file") as error:
-        read(log.with_name(f"none{suffix}"))
+        read(log.with_name(f"none{log.suffix}"))
     one_line(error)
-    for file in data_files(log):
-        file.write_bytes(b"")
+    data_files(log)[0].write_bytes(b"")
     with pytest.raises(FileFormatError, match="is empty") as error:
-        read_back(variant, log, **({} if log.is_file() else {"format": variant.split()[0]}))
+        read_back(variant, log, **by_name(variant, log))
     one_line(error)
 
 

@@ -161,7 +161,7 @@ def union(signals: list[tuple[Stamps, Values, list[int]]], channels: int) -> tup
 def longest_allowed(stamps: Stamps, max_gap_s: float | Literal["auto"] | None) -> int | None:
     """Nanoseconds above which a step is an outage; None where none is.
 
-    `auto` is 20 times the 99th percentile of the steps, the longest one left out, and at least 1 s;
+    `auto` is 20 times the 95th percentile of the steps, the longest one left out, and at least 1 s;
     fewer than 20 steps say too little of what is usual, and none of them is an outage.
     """
     if max_gap_s is None:
@@ -171,5 +171,5 @@ def longest_allowed(stamps: Stamps, max_gap_s: float | Literal["auto"] | None) -
     steps = np.diff(stamps)
     if len(steps) < _FEW_STEPS:
         return None
-    rank = min(math.ceil(0.99 * (len(steps) - 1)), len(steps) - 2)
+    rank = min(math.ceil(0.95 * (len(steps) - 1)), len(steps) - 2)
     return max(_SECOND, 20 * int(np.partition(steps, rank)[rank]))

@@ -30,7 +30,7 @@ class Policies:
         clock_jumps: where a clock was set back, or forth by more than a day, while it was logged:
             `split` into episodes, `join` as if the rows only lacked order, or `refuse` the file.
         max_gap_s: a longer time without any row is an outage, and splits into episodes. `auto` is
-            20 times the 99th percentile of the steps between rows, and at least 1 s; None never
+            20 times the 95th percentile of the steps between rows, and at least 1 s; None never
             splits.
         min_rows: an episode that a split leaves with fewer rows than this is left out.
         held: channels of a slower sensor that a faster log repeats: `keep` the repeated values, or
