@@ -20,8 +20,15 @@ SIDES = ("between", "after_last", "before_first")
 START: NDArray[np.float64] = np.array([[0.5, 0.5, 0, 0, 0], [0.0] * 5, [0.0] * 5])
 """(sides, 5) the weights before anything is known of the data."""
 
-RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0)
+RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Strengths that are tried, as numbers of cells."""
+
+PLAIN: dict[str, tuple[tuple[int, ...], int]] = {
+    "line": ((0,), 3),
+    "pchip": ((0,), 4),
+    "hold": ((1, 2), 0),
+}
+"""What is tried beside them: sides it is for, and the only weight that is 1. No model has a say."""
 
 FOLDS = 5
 """Parts of the validation trajectories, each left out once to choose the strength."""
@@ -37,13 +44,14 @@ class FillRule:
         gap_unit: s, the length of the shortest group.
         weights: (channels, sides, groups, 5) w1 to w5; outside, the first is v.
         cells: (sides, groups) hidden cells of the validation data.
-        ridge: how many cells the weights that a group is held towards count as.
+        chosen: per channel and side, how its weights came about: `start`, `ridge 30`, or one of
+            `PLAIN`.
     """
 
     gap_unit: float
     weights: _Array
     cells: NDArray[np.int64]
-    ridge: float
+    chosen: tuple[tuple[str, ...], ...]
 
     def __post_init__(self) -> None:
         weights = np.asarray(self.weights, dtype=np.float64)
@@ -58,12 +66,17 @@ class FillRule:
             raise InputError("a rule needs finite weights, a count per group, a gap unit above 0")
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "cells", cells)
+        chosen = tuple(tuple(map(str, names)) for names in self.chosen)
+        if [len(names) for names in chosen] != [len(SIDES)] * len(weights):
+            raise InputError("a rule needs a word per channel and side for how it was chosen")
+        object.__setattr__(self, "chosen", chosen)
 
     @classmethod
     def start(cls, channels: int, gap_unit: float) -> FillRule:
         """The rule before anything is known of the data."""
         weights = np.broadcast_to(START[:, None], (channels, len(SIDES), GROUPS, START.shape[1]))
-        return cls(gap_unit, weights, np.zeros((len(SIDES), GROUPS), dtype=np.int64), RIDGES[-1])
+        cells = np.zeros((len(SIDES), GROUPS), dtype=np.int64)
+        return cls(gap_unit, weights, cells, (("start",) * len(SIDES),) * channels)
 
     @property
     def model_share(self) -> list[tuple[float, float]]:
@@ -81,7 +94,7 @@ class FillRule:
         """JSON-like form; floats survive to the last bit."""
         return {
             "gap_unit_s": self.gap_unit,
-            "ridge": self.ridge,
+            "chosen": [list(names) for names in self.chosen],
             "weights": self.weights.tolist(),
             "cells": self.cells.tolist(),
         }
@@ -89,12 +102,8 @@ class FillRule:
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> FillRule:
         """The inverse of `to_dict`."""
-        return cls(
-            value["gap_unit_s"],
-            np.array(value["weights"]),
-            np.array(value["cells"]),
-            value["ridge"],
-        )
+        weights, cells = np.array(value["weights"]), np.array(value["cells"])
+        return cls(value["gap_unit_s"], weights, cells, value["chosen"])
 
 
 def group_of(length: _Array, unit: float) -> NDArray[np.int64]:
@@ -118,6 +127,7 @@ class NormalEquations:
         self._moment = np.zeros((*shape, size))
         self._square = np.zeros(shape)
         self._cells = np.zeros(shape, dtype=np.int64)
+        self._heard = np.zeros(shape[1:3], dtype=np.int64)  # trajectories, per channel and side
         self._added = 0
 
     def add(
@@ -139,6 +149,8 @@ class NormalEquations:
         """
         fold = self._added % FOLDS
         self._added += 1
+        for s in range(len(SIDES)):
+            self._heard[:, s] += (counted & (side == s)).any(axis=0)
         rows, channels = np.nonzero(counted)
         phi, y = terms[rows, channels], missed[rows, channels]
         group = group_of(length[rows, channels], self.gap_unit)
@@ -149,52 +161,83 @@ class NormalEquations:
         np.add.at(self._cells, at, 1)
 
     def rule(self) -> FillRule:
-        """The weights, with the strength that does best on trajectories left out."""
-        ridge = RIDGES[len(RIDGES) // 2]
-        if self._added >= 2:
-            ridge = min(RIDGES, key=self._left_out)
-        weights = self._solved(slice(None), ridge)
-        return FillRule(self.gap_unit, weights, self._cells.sum(axis=(0, 1)), ridge)
+        """The weights; per channel and side, what does best on the trajectories left out.
 
-    def _left_out(self, ridge: float) -> float:
-        """Squared error of all cells, each with weights from the other folds."""
-        error = 0.0
-        for fold in range(min(FOLDS, self._added)):
-            w = self._solved(np.arange(FOLDS) != fold, ridge)
-            gram, moment = self._gram[fold], self._moment[fold]
-            fitted = np.einsum("...i,...ij,...j", w, gram, w) - 2 * (w * moment).sum(-1)
-            error += float((self._square[fold] + fitted).sum())
-        return error
+        Where channels are taken together, each counts relative to what its weights are to make up
+        for: else the noisiest ones would choose for all. Cells of one gap are much alike, so fewer
+        than `FOLDS` trajectories choose nothing: there the weights are held as strongly as can be
+        between observations, and keep their start outside.
+        """
+        size = self._square.sum((0, 3)) / np.maximum(self._cells.sum((0, 3)), 1)
+        relative = 1 / np.where(size > 0, size, 1.0)  # (channels, sides)
+        tried = {f"ridge {ridge:g}": self._ridge(ridge, relative) for ridge in RIDGES}
+        strongest = len(tried) - 1
+        for name, (sides, weight) in PLAIN.items():
+            tried[name] = self._plain(sides, weight)
+        names = list(tried)
+        best = np.argmin([error for _, error in tried.values()], axis=0)
+        few = self._heard < FOLDS
+        best[few] = strongest
+        chosen = [[names[k] for k in row] for row in best]
+        weights = np.empty(self._moment.shape[1:])
+        for (c, s), k in np.ndenumerate(best):
+            weights[c, s] = tried[names[k]][0][c, s]
+            if few[c, s] and s > 0:
+                weights[c, s], chosen[c][s] = START[s], "start"
+        return FillRule(
+            self.gap_unit, weights, self._cells.sum(axis=(0, 1)), tuple(map(tuple, chosen))
+        )
 
-    def _solved(self, folds: Any, ridge: float) -> _Array:
-        """(channels, sides, groups, 5): each group held towards its side, channels towards all."""
+    def _ridge(self, ridge: float, relative: _Array) -> tuple[_Array, _Array]:
+        """The weights, and (channels, sides) squared errors with weights from the other folds."""
+        error = np.zeros(relative.shape)
+        for fold in range(min(FOLDS, self._added) if self._added > 1 else 0):
+            kept = self._solved(np.arange(FOLDS) != fold, ridge, relative)
+            error += self._error(np.arange(FOLDS) == fold, kept)
+        return self._solved(slice(None), ridge, relative), error
+
+    def _plain(self, sides: tuple[int, ...], weight: int) -> tuple[_Array, _Array]:
+        """Weights that are one predictor alone, and (channels, sides) its squared errors."""
+        weights = np.zeros(self._moment.shape[1:])
+        weights[..., weight] = 1.0
+        error = self._error(slice(None), weights)
+        error[:, [s for s in range(len(SIDES)) if s not in sides]] = np.inf
+        return weights, error
+
+    def _error(self, folds: Any, weights: _Array) -> _Array:
+        """(channels, sides) squared error of weights on the cells of some folds."""
         gram, moment = self._gram[folds].sum(0), self._moment[folds].sum(0)
+        fitted = np.einsum("...i,...ij,...j", weights, gram, weights)
+        fitted = fitted - 2 * (weights * moment).sum(-1) + self._square[folds].sum(0)
+        return np.asarray(fitted.sum(axis=2))
+
+    def _solved(self, folds: Any, ridge: float, relative: _Array) -> _Array:
+        """(channels, sides, groups, 5): each group held towards its side, channels towards all."""
+        gram = self._gram[folds].sum(0) * relative[:, :, None, None, None]
+        moment = self._moment[folds].sum(0) * relative[:, :, None, None]
         cells = self._cells[folds].sum(0)
         weights = np.empty(moment.shape)
         for s, start in enumerate(START):
-            count = int(cells[:, s].sum())
-            side = _held(gram[:, s].sum((0, 1)), moment[:, s].sum((0, 1)), count, ridge, start)
+            side = _held(
+                gram[:, s].sum((0, 1)),
+                moment[:, s].sum((0, 1)),
+                int(cells[:, s].sum()),
+                ridge,
+                start,
+            )
             for g in range(GROUPS):
-                all_gram, count = gram[:, s, g].sum(0), int(cells[:, s, g].sum())
-                together = _held(all_gram, moment[:, s, g].sum(0), count, ridge, side)
+                count = int(cells[:, s, g].sum())
+                together = _held(gram[:, s, g].sum(0), moment[:, s, g].sum(0), count, ridge, side)
                 for c in range(self.channels):
-                    weights[c, s, g] = _held(
-                        gram[c, s, g], moment[c, s, g], count, ridge, together, all_gram
-                    )
+                    count = int(cells[c, s, g])
+                    weights[c, s, g] = _held(gram[c, s, g], moment[c, s, g], count, ridge, together)
         return weights
 
 
-def _held(
-    gram: _Array,
-    moment: _Array,
-    cells: int,
-    ridge: float,
-    towards: _Array,
-    typical: _Array | None = None,
-) -> _Array:
+def _held(gram: _Array, moment: _Array, cells: int, ridge: float, towards: _Array) -> _Array:
     """Least squares, held towards given weights with the force of `ridge` cells."""
     if not cells:
         return towards
-    scale = ridge * np.diag(gram if typical is None else typical) / cells
+    scale = ridge * np.diag(gram) / cells
     step = np.linalg.pinv(gram + np.diag(scale), rcond=1e-12, hermitian=True)
     return np.asarray(towards + step @ (moment - gram @ towards))

@@ -22,8 +22,10 @@ observed gets the mean of both predictions.
 
 The weights are the least-squares solution on hidden cells of validation data: by length of the gap
 (outside, of the distance) and channel, held by ridge towards those of all channels together, these
-towards those of all lengths, and these towards `fill_rule.START`. The strength of the ridge is the
-one that does best on validation trajectories left out.
+towards those of all lengths, and these towards `fill_rule.START`. The strength of the ridge is, for
+each channel, the one that does best on validation trajectories left out; where the line, PCHIP or
+holding the value does better alone, the channel gets that. Where fewer than five validation
+trajectories have such a cell, nothing is chosen outside.
 """
 
 from __future__ import annotations
