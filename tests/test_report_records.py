@@ -71,7 +71,7 @@ def test_curves_of_a_run_that_is_not_recorded_are_left_out(record):
     [
         ("honest_mse", np.nan, r"honest_mse of run 'e1-gru-90-r00' is nan"),
         ("published_mse", np.inf, "published_mse of run"),
-        ("seconds", -1.0, "expected finite and at least 0"),
+        ("seconds", -1.0, "expected a finite number of at least 0"),
         ("hidden_rows_0_share", 1.5, "expected from 0 to 1"),
         ("observed_fraction", 0.0, "observed_fraction of run"),
     ],

@@ -203,7 +203,7 @@ def test_missing_repeats_are_counted_in_the_cell_and_named_below(record):
 
 
 def test_a_number_whose_runs_were_not_made_alike_is_marked_and_no_other(record):
-    at = np.flatnonzero(record.runs["run_id"] == "e2-gru-90-r00")
+    at = np.flatnonzero(record.runs["run_id"] == "e2-gru_d-90-r00")
     table = tables.repeats_table(made.changed(record, at, kernel_body="other"), repeats=6)
     marked = [
         (block.heading, label, i)
@@ -212,7 +212,10 @@ def test_a_number_whose_runs_were_not_made_alike_is_marked_and_no_other(record):
         for i, cell in enumerate(cells)
         if cell.mark
     ]
-    assert marked == [("Ours, published scoring", "GRU", 0), ("Ours, honest scoring", "GRU", 0)]
+    assert marked == [
+        ("Ours, published scoring", "GRU-D", 0),
+        ("Ours, honest scoring", "GRU-D", 0),
+    ]
     assert any(note.startswith(MIXED) for note in table.notes)
     assert not any(n.startswith(MIXED) for n in tables.repeats_table(record, repeats=6).notes)
 
