@@ -181,7 +181,9 @@ def test_a_published_record_tells_the_same_and_its_commands(tmp_path):
     assert dict(told.machine) == {"platform": "Linux", "cores": "2", "scipy": "1.17.1"}
 
 
-@pytest.mark.parametrize("text", ["", "[1]", '"x"', "{", '{"sittings": 3, "here": [], "commands": 1}'])
+@pytest.mark.parametrize(
+    "text", ["", "[1]", '"x"', "{", '{"sittings": 3, "here": [], "commands": 1}']
+)
 def test_a_damaged_file_beside_the_record_is_left_out(tmp_path, text):
     for name in ("protocol.json", "sittings.json", "about.json"):
         (tmp_path / name).write_text(text)

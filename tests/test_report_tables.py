@@ -85,7 +85,15 @@ SMALL = Table(
     ("90 %", "x_1"),
     (
         Block("First", (("GRU", (Cell("0.1 ± 0.2", 0.1, 0.2, 3, bold=True), Cell())),)),
-        Block("Second", (("A < B", (Cell("−1", -1.0, mark=MIXED), Cell("2", 2.0)),),)),
+        Block(
+            "Second",
+            (
+                (
+                    "A < B",
+                    (Cell("−1", -1.0, mark=MIXED), Cell("2", 2.0)),
+                ),
+            ),
+        ),
     ),
     ("A note.",),
 )
@@ -126,7 +134,7 @@ def test_a_table_as_html_has_a_caption_header_cells_and_nothing_unescaped():
     assert "<caption><span><b>Table A.1.</b> Errors, 90 % &amp; more.</span></caption>" in html
     assert '<th scope="col">90 %</th>' in html
     assert '<th scope="row">A &lt; B</th>' in html
-    assert '<td><b>0.1 ± 0.2</b></td>' in html
+    assert "<td><b>0.1 ± 0.2</b></td>" in html
     assert "<td>−1<sup>†</sup></td>" in html
 
 
@@ -229,7 +237,12 @@ def test_table_3_7_is_shapiro_wilk_on_the_rmse(record):
     expected = stats.shapiro(np.sqrt(record.values("honest_mse", rows))).pvalue
     cell = rows_of(table, "Ours, honest scoring")["ODE-RNN"][2]
     assert cell.value == pytest.approx(expected)
-    assert [c.value for c in rows_of(table, "Thesis")["ODE-GRU-D"]] == [0.0638, 0.9261, 0.8953, 0.1214]
+    assert [c.value for c in rows_of(table, "Thesis")["ODE-GRU-D"]] == [
+        0.0638,
+        0.9261,
+        0.8953,
+        0.1214,
+    ]
 
 
 def rmse(record, model, fraction, scoring="published"):
