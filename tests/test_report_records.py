@@ -101,7 +101,7 @@ def test_a_record_without_runs_is_refused(record):
 def test_what_is_not_a_record_is_told_what_one_is(tmp_path):
     with pytest.raises(FileFormatError, match="not there; give the folder"):
         read_record(tmp_path / "nowhere")
-    with pytest.raises(FileFormatError, match="neither record.parquet nor record.csv"):
+    with pytest.raises(FileFormatError, match=r"neither record\.parquet nor record\.csv"):
         read_record(tmp_path)
     (tmp_path / "record.parquet").write_bytes(b"no table")
     with pytest.raises(FileFormatError, match=r"record\.parquet"):
