@@ -30,7 +30,7 @@ SMALL = replace(
     repeats=2,
 )
 
-LONG = replace(SMALL, epochs_of_curves=400)
+LONG = replace(SMALL, epochs_of_curves=50)
 """Its runs of experiment 1 last long enough to be killed in the middle."""
 
 ONLY = "experiment=1,model=gru,model=ode_gru_d"

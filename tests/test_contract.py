@@ -34,13 +34,13 @@ from offbeat import (
     ModelConfig,
     RecurrentModel,
     Trajectory,
+    kernels,
     load_checkpoint,
     make,
     predict,
     save_checkpoint,
     thesis_config,
 )
-from offbeat.kernels import written_out
 from offbeat.models.zoo import THESIS_MODELS, ZOO, resolve
 
 FLOAT32, FLOAT64 = torch.float32, torch.float64
@@ -91,11 +91,6 @@ def build(variant: str, dtype: torch.dtype = FLOAT64, **options: Any) -> Recurre
     return small_model(replace(VARIANTS[variant], **options), dtype=dtype)
 
 
-def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leaves the reference body of the scan alone."""
-    monkeypatch.setattr(written_out, "supports", lambda spec, rows: False)
-
-
 # --- deterministic, finite, kept ------------------------------------------------------------------
 
 
@@ -115,7 +110,7 @@ def test_single_and_double_precision_agree(variant: str) -> None:
     data = dataset(4)
     got, expected = (predictions(m, m.batch(data)) for m in (single, double))
     assert (got.dtype, expected.dtype) == (FLOAT32, FLOAT64)
-    adaptive = double.spec.has_field and double.spec.solver in ("dopri5", "tsit5")
+    adaptive = bool(double.spec.field) and double.spec.solver in ("dopri5", "tsit5")
     assert error(got, expected) < (1e-3 if adaptive else 1e-5)
 
 
@@ -419,16 +414,14 @@ def test_a_gradient_reaches_every_parameter_under_masks_per_channel(variant: str
 
 
 @variants
-def test_the_bodies_of_the_scan_agree_in_values_and_gradients(
-    variant: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bodies_of_the_scan_agree_in_values_and_gradients(variant: str) -> None:
     model = build(variant)
     batch = model.batch(dataset(4))
     got, found = predictions(model, batch), gradients(model, batch)
-    without_kernels(monkeypatch)
-    assert error(got, predictions(model, batch)) < 1e-12
-    for name, expected in gradients(model, batch).items():
-        assert error(found[name], expected) < 1e-11, name  # type: ignore[arg-type]
+    with kernels.use("reference"):
+        assert error(got, predictions(model, batch)) < 1e-12
+        for name, expected in gradients(model, batch).items():
+            assert error(found[name], expected) < 1e-11, name  # type: ignore[arg-type]
 
 
 # --- extremes -------------------------------------------------------------------------------------

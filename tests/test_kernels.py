@@ -1,146 +1,392 @@
-"""The bodies of the scan agree, in values and in gradients, and free what they record."""
+"""The bodies of the scan: values, gradients, bits, memory."""
+
+from __future__ import annotations
 
 import gc
+import itertools
 import weakref
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from model_helpers import SMALL, dataset, draw_weights
+from scan_problems import CELLS, FLOWS, Problem, largest_error, problem, run
 
 import offbeat as ob
-from offbeat.kernels import reference, scan, written_out
-from offbeat.models import recurrence
+from offbeat import kernels
+from offbeat.kernels import ScanRows, fused, reference
 from offbeat.models.zoo import ZOO
 
-# What the written-out body claims to run: a GRU or a start value, no field or one Euler step.
-COMBINATIONS = [
-    ("gru", {}),
-    ("gru", {"update_rows": "every", "age_input": "delta"}),
-    ("rnn_decay", {}),
-    ("gru_d", {}),
-    ("gru_d", {"decay_rows": "every_row", "readout": "last_row"}),
-    ("neural_ode", {}),
-    ("neural_ode", {"activation": "silu", "field_units": ()}),
-    ("ode_rnn", {"field_units": (6, 5, 4)}),
-    ("ode_gru_d", {}),
-    ("ode_gru_d", {"decay_rows": "observed_rows", "readout": "last_row", "activation": "silu"}),
-    ("anchored_ode_gru_d", {}),
-    ("anchored_ode_gru_d", {"decay": "trainable", "activation": "tanh", "field_units": (6, 5)}),
-    ("anchored_ode_gru_d", {"vector_field": "none"}),
-]
+needs_fused = pytest.mark.skipif(not fused.bodies(), reason="the fused body was not built")
+bodies = pytest.mark.parametrize("body", fused.bodies() or ["none"])
+TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
-def made(name: str, options: dict) -> tuple[ob.RecurrentModel, ob.Batch]:
-    data = dataset(5, seed=3)
-    model = draw_weights(ob.make(name, data, **{**SMALL, **options}))
-    return model, model.batch(data)
+def agree(case: Problem, body: str, *, keep: bool = True, strict: bool = True) -> None:
+    """The fused body runs this very call, or raises; its results equal the reference body's.
+
+    Where it is not `strict`, shapes are random, and a tensor may be all cancellation: its largest
+    entry counts as at least a thousandth of all tensors' largest, and in single precision it is
+    enough to be as near to double precision as the reference body is, times three.
+    """
+    expected = run(reference.scan, case)
+    with pytest.MonkeyPatch.context() as patch:
+        if not keep:
+            patch.setattr(fused, "TAPE_LIMIT", 0)
+        got = run(lambda *a: fused.scan(*a, body), case)
+    exact = expected
+    if not strict and case.state.dtype == torch.float32:
+        exact = run(reference.scan, case.double())
+    least = 0.0 if strict else 1e-3 * max(float(v.abs().max()) for v in expected.values())
+    for name, value in expected.items():
+        assert bool(value.isfinite().all()), name
+        allowed = TOLERANCE[value.dtype] * max(float(exact[name].abs().max()), least)
+        allowed = max(allowed, 3 * float((value - exact[name]).abs().max()))
+        found = float((got[name] - exact[name]).abs().max())
+        assert found <= allowed, f"{name}: off by {found:.2g}, allowed {allowed:.2g}"
 
 
-def values_and_gradients(model, batch, body, monkeypatch):
-    ran = []
-
-    def spy(*args):
-        ran.append(body)
-        return body(*args)
-
-    monkeypatch.setattr(recurrence, "scan", spy)
-    model.zero_grad()
-    output = model(batch)
-    loss = (output.predictions.sin() + 0.1 * output.after.square().sum(dim=2, keepdim=True)).mean()
-    loss.backward()
-    assert ran == [body]
-    gradients = {name: p.grad.clone() for name, p in model.named_parameters()}
-    return {"predictions": output.predictions.detach(), **gradients}
+# --- equal to the reference -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "options"), COMBINATIONS)
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
-def test_the_written_out_body_equals_the_reference(name, options, dtype, tolerance, monkeypatch):
-    model, batch = made(name, options)
-    model, batch = model.to(dtype), batch.to(dtype=dtype)
-    expected = values_and_gradients(model, batch, reference.scan, monkeypatch)
-    got = values_and_gradients(model, batch, written_out.scan, monkeypatch)
+@needs_fused
+@bodies
+@pytest.mark.parametrize("flow", list(FLOWS))
+@pytest.mark.parametrize("cell", list(CELLS))
+@settings(max_examples=6, deadline=None)
+@given(data=st.data())
+def test_the_fused_body_equals_the_reference(cell: str, flow: str, body: str, data: Any) -> None:
+    """Every cell, solver, anchored state and self-feeding, over random shapes, masks and gaps."""
+    case = data.draw(problems(cell, flow))
+    agree(case, body, keep=data.draw(st.booleans()), strict=False)
+
+
+@st.composite
+def problems(draw: Any, cell: str, flow: str) -> Problem:
+    plain = cell in ("none", "set")
+    anchored = cell != "none" and draw(st.booleans())
+    return problem(
+        seed=draw(st.integers(0, 10**6)),
+        batch=draw(st.integers(1, 40)),
+        rows=draw(st.integers(1, 12)),
+        channels=draw(st.integers(1, 5)),
+        hidden=draw(st.integers(1, 9)),
+        cell=cell,
+        flow=flow,
+        anchored=anchored,
+        self_feeding=not anchored and not plain and draw(st.booleans()),
+        input_decay=not anchored and cell != "none" and draw(st.booleans()),
+        decay=draw(st.sampled_from(["none", "ages", "elapsed"])),
+        decay_rows=draw(st.sampled_from(["continuous", "every_row", "observed_rows"])),
+        ages=draw(st.sampled_from([0, 1, 3])),
+        activation=draw(st.sampled_from(["tanh", "silu"])),
+        padded=draw(st.booleans()),
+        dtype=draw(st.sampled_from([torch.float32, torch.float64])),
+    )
+
+
+LARGE = {
+    "ODE-GRU-D of the thesis": {
+        "cell": "gru", "flow": "euler", "decay": "ages", "decay_rows": "every_row",
+        "input_decay": True, "units": (100, 100, 100, 100), "batch": 50, "rows": 100,
+    },
+    "anchored, batch 257 of 400 rows": {
+        "cell": "gru", "flow": "euler", "anchored": True, "activation": "silu", "hidden": 31,
+        "units": (37, 41), "batch": 257, "rows": 400, "padded": True,
+    },
+    "GRU-D that feeds itself": {
+        "cell": "gru", "flow": "none", "decay": "ages", "decay_rows": "observed_rows",
+        "input_decay": True, "self_feeding": True, "batch": 129, "rows": 101, "padded": True,
+    },
+    "LSTM, midpoint steps of bounded length": {
+        "cell": "lstm", "flow": "midpoint, longest step", "batch": 33, "rows": 63,
+        "units": (17, 23), "padded": True, "ages": 1,
+    },
+    "GRU with the reset after, RK4, decay within the gap": {
+        "cell": "gru, reset after", "flow": "rk4, several steps", "decay": "ages", "batch": 65,
+        "rows": 50, "units": (19,), "padded": True,
+    },
+    "Elman, Heun, one trajectory": {
+        "cell": "elman", "flow": "heun", "batch": 1, "rows": 399, "units": (29, 13), "ages": 3,
+    },
+}  # fmt: skip
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("name", list(LARGE))
+def test_the_fused_body_equals_the_reference_at_full_size(
+    name: str, dtype: torch.dtype, body: str
+) -> None:
+    options: dict[str, Any] = {"channels": 14, "hidden": 15, **LARGE[name]}
+    agree(problem(seed=7, dtype=dtype, scale=0.15, **options), body)
+
+
+@needs_fused
+@pytest.mark.parametrize("cell", [cell for cell in CELLS if cell != "none"])
+def test_gradients_equal_finite_differences(cell: str) -> None:
+    case = problem(
+        seed=3, batch=3, rows=4, channels=2, hidden=3, cell=cell, flow="heun", decay="ages",
+        input_decay=True, units=(4,), padded=True, dtype=torch.float64,
+    )  # fmt: skip
+    spec, weights, rows, state, _ = case
+    inputs = (*weights.tensors(), state)
+
+    def function(*tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return fused.scan(spec, case.with_weights(tensors[:-1]), rows, tensors[-1])
+
+    assert torch.autograd.gradcheck(function, inputs, atol=1e-7, rtol=1e-5)
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize(("rows", "sizes"), [(1, (3, 2)), (777, (15, 100, 14)), (65, (5, 9, 7, 3))])
+def test_a_fused_perceptron_equals_the_reference(
+    rows: int, sizes: tuple[int, ...], dtype: torch.dtype, activation: str, body: str
+) -> None:
+    generator = torch.Generator().manual_seed(1)
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).mul(0.4).to(dtype)
+
+    layers = tuple(
+        (drawn(o, i).requires_grad_(), drawn(o).requires_grad_())
+        for i, o in itertools.pairwise(sizes)
+    )
+    x, weight = drawn(rows, sizes[0]).requires_grad_(), drawn(rows, sizes[-1])
+    found = []
+    for y in (
+        fused.perceptron(layers, x, activation, body),
+        reference.perceptron(layers, x, activation),
+    ):
+        leaves = [x, *(t for layer in layers for t in layer)]
+        found.append([y.detach(), *torch.autograd.grad((y * weight).sum(), leaves)])
+    for got, expected in zip(*found, strict=True):
+        assert largest_error(got, expected) <= TOLERANCE[dtype]
+
+
+# --- the same bits --------------------------------------------------------------------------------
+
+BITS = {
+    "anchored": {"cell": "gru", "flow": "euler", "anchored": True, "activation": "silu"},
+    "lstm": {"cell": "lstm", "flow": "rk4, several steps", "decay": "ages"},
+    "gru_d": {"cell": "gru", "flow": "none", "decay": "ages", "input_decay": True},
+    "bounded steps": {"cell": "gru", "flow": "midpoint, longest step", "decay": "elapsed"},
+}
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("name", list(BITS))
+def test_the_number_of_threads_changes_no_bit(name: str, body: str) -> None:
+    case = problem(seed=5, batch=150, rows=9, channels=4, hidden=7, padded=True, **BITS[name])
+    threads = torch.get_num_threads()
+    found = []
+    try:
+        for n in (1, 2, 3, 7):
+            torch.set_num_threads(n)
+            found.append(run(lambda *a: fused.scan(*a, body), case))
+    finally:
+        torch.set_num_threads(threads)
+    for other in found[1:]:
+        for key, value in found[0].items():
+            assert torch.equal(other[key], value), key
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("name", list(BITS))
+def test_batch_mates_padding_and_place_change_no_bit_of_a_trajectory(name: str, body: str) -> None:
+    case = problem(seed=6, batch=37, rows=12, channels=4, hidden=7, padded=True, **BITS[name])
+    spec, weights, rows, state, _ = case
+    assert rows.length is not None
+    with torch.no_grad():
+        whole = fused.scan(spec, weights, rows, state, body)
+        for i in (0, 5, 36):
+            n = int(rows.length[i])
+            alone = fused.scan(
+                spec, weights, cut(rows, slice(i, i + 1), slice(0, n)), state[i : i + 1], body
+            )
+            for got, expected in zip(alone, whole, strict=True):
+                assert torch.equal(got[0], expected[i, :n])
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("name", list(BITS))
+def test_row_by_row_gives_the_bits_of_the_whole_sequence(name: str, body: str) -> None:
+    case = problem(seed=8, batch=19, rows=11, channels=4, hidden=7, **BITS[name])
+    spec, weights, rows, state, _ = case
+    with torch.no_grad():
+        before, after = fused.scan(spec, weights, rows, state, body)
+        for i in range(rows.rows):
+            part = cut(rows, slice(None), slice(i, i + 1))
+            one_before, one_after = fused.scan(spec, weights, part, state, body)
+            assert torch.equal(one_before[:, 0], before[:, i])
+            assert torch.equal(one_after[:, 0], after[:, i])
+            state = one_after[:, 0]
+
+
+def cut(rows: ScanRows, lanes: slice, at: slice) -> ScanRows:
+    """Some rows of some trajectories; none of them is padding."""
+    changed: dict[str, Any] = {"length": None}
+    for name in ("gap", "update", "values", "mask", "age", "updated", "decay_start", "decay_end",
+                 "delta", "last"):  # fmt: skip
+        value = getattr(rows, name)
+        changed[name] = None if value is None else value[lanes, at]
+    return replace(rows, **changed)
+
+
+@needs_fused
+def test_padding_receives_no_gradient_and_gives_none() -> None:
+    case = problem(seed=9, batch=21, rows=10, channels=3, hidden=5, cell="gru", flow="euler",
+                   decay="ages", padded=True)  # fmt: skip
+    length = case.rows.length
+    assert length is not None
+    assert int(length.min()) < 10
+    padding = torch.arange(10) >= length[:, None]
+    wild = replace(
+        case.rows,
+        values=torch.where(padding[..., None], float("nan"), case.rows.values),
+        gap=torch.where(padding, 1e30, case.rows.gap),
+    )
+    expected = run(fused.scan, case)
+    got = run(fused.scan, case._replace(rows=wild))
     for key, value in expected.items():
-        largest = float(value.abs().max())
-        assert largest > 0, key
-        assert float((got[key] - value).abs().max()) <= tolerance * largest, key
+        assert torch.equal(got[key], value), key
 
 
-@pytest.mark.parametrize("name", sorted(ZOO))
-def test_the_fastest_body_that_can_is_the_one_that_runs(name, monkeypatch):
-    ran = []
-    for body in (written_out, reference):
-        original = body.scan
-        label = body.__name__.rsplit(".", 1)[-1]
-        monkeypatch.setattr(body, "scan", lambda *a, o=original, w=label: (ran.append(w), o(*a))[1])
-    model, batch = made(name, {})
-    model(batch)
-    assert ran == ["reference" if name in ("rnn", "lstm") else "written_out"]
+# --- what it takes and refuses --------------------------------------------------------------------
 
 
+@needs_fused
+def test_arrays_are_taken_as_they_are_or_refused() -> None:
+    """A silent copy of another type or stride would be slow, and wrong where it is written to."""
+    case = problem(seed=1, batch=2, rows=3, channels=2, hidden=3, cell="gru", flow="euler")
+    good = {
+        "gap": case.rows.gap.numpy(), "update": case.rows.update.numpy(), "updated": None,
+        "values": case.rows.values.numpy(), "mask": case.rows.mask.numpy(), "age": None,
+        "decay_start": None, "decay_end": None, "delta": None, "last": None, "mean": None,
+        "fed": None, "length": None,
+    }  # fmt: skip
+    make = fused.compiled.Facts_f32
+    make(**good)
+    with pytest.raises(TypeError):
+        make(**{**good, "values": good["values"].astype("float64")})
+    with pytest.raises(TypeError):
+        make(**{**good, "gap": good["gap"].astype("int32")})
+    with pytest.raises(TypeError):
+        make(**{**good, "length": case.rows.gap[:, 0].numpy()})
+
+
+@needs_fused
 @pytest.mark.parametrize(
-    ("name", "options"),
+    ("change", "message"),
     [
-        ("rnn", {}),
-        ("lstm", {}),
-        ("gru", {"reset_after": True}),
-        ("gru", {"self_feeding": 0.5}),
-        ("ode_rnn", {"solver": "midpoint"}),
-        ("ode_rnn", {"steps_per_gap": 2}),
-        ("ode_rnn", {"max_step": 0.1}),
-        ("ode_rnn", {"gradient": "adjoint"}),
+        ({"gap": torch.zeros(2, 4)}, "update has shape"),
+        ({"values": torch.zeros(2, 3, 5)}, "values has shape"),
+        ({"mask": torch.zeros(2, 3)}, "mask has shape"),
+        ({"length": torch.zeros(3, dtype=torch.int64)}, "length has shape"),
     ],
 )
-def test_what_the_written_out_body_cannot_run_goes_to_the_reference(name, options, monkeypatch):
-    model, batch = made(name, options)
-    monkeypatch.setattr(written_out, "scan", lambda *_: pytest.fail("the wrong body ran"))
+def test_shapes_that_disagree_are_refused_by_name(change: dict[str, Any], message: str) -> None:
+    case = problem(seed=1, batch=2, rows=3, channels=2, hidden=3, cell="gru", flow="euler")
+    with pytest.raises(ValueError, match=message):
+        fused.scan(case.spec, case.weights, replace(case.rows, **change), case.state)
+
+
+@needs_fused
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"solver": "dopri5"}, "chooses its own steps"),
+        ({"gradient": "adjoint"}, "adjoint"),
+        ({"field_units": (3,) * 17}, "more than 16 layers"),
+    ],
+)
+def test_what_the_fused_body_cannot_run_goes_to_the_reference(
+    options: dict[str, Any], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, batch = made("ode_rnn", options)
+    rows, _ = model.facts(batch)
+    state = model.empty_carry(len(batch)).state
+    assert why in fused.unsupported(model.spec, model.scan_weights(), rows, state)
+    with pytest.raises(RuntimeError, match=why):
+        fused.scan(model.spec, model.scan_weights(), rows, state)
+    monkeypatch.setattr(fused, "scan", lambda *_: pytest.fail("the wrong body ran"))
     model(batch)
 
 
-def test_observed_values_that_need_a_gradient_go_to_the_reference_and_get_one():
+@needs_fused
+@pytest.mark.parametrize("name", sorted(ZOO))
+def test_every_model_of_the_zoo_runs_in_the_fused_body(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reference, "scan", lambda *_: pytest.fail("the wrong body ran"))
+    model, batch = made(name, {})
+    model(batch).predictions.sum().backward()
+    monkeypatch.undo()
+    with kernels.use("reference"):
+        monkeypatch.setattr(fused, "scan", lambda *_: pytest.fail("the wrong body ran"))
+        model(batch)
+
+
+def test_observed_values_that_need_a_gradient_go_to_the_reference_and_get_one() -> None:
     model, batch = made("anchored_ode_gru_d", {})
     batch = replace(batch, values=batch.values.clone().requires_grad_())
     model(batch).predictions.sum().backward()
     gradient = batch.values.grad
+    assert gradient is not None
     assert bool((gradient[batch.mask] != 0).any())
     assert bool((gradient[~batch.mask] == 0).all()), "hidden values reach no prediction"
 
 
+def test_a_body_that_cannot_run_here_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ob.InputError, match="scan body 'cuda'"), kernels.use("cuda"):
+        pass
+    monkeypatch.setenv("OFFBEAT_SCAN", "reference")
+    assert kernels.body() == ("reference", "asked for by OFFBEAT_SCAN")
+    monkeypatch.setenv("OFFBEAT_SCAN", "fused")
+    monkeypatch.setattr(fused, "bodies", list)
+    with pytest.raises(ob.InputError, match="was not built"):
+        kernels.body()
+
+
+def test_without_the_compiled_module_everything_runs_in_the_reference_body(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(fused, "compiled", None)
+    monkeypatch.setattr(fused, "why_not", "no module")
+    assert kernels.body() == ("reference", "the fused body was not built: no module")
+    model, batch = made("ode_gru_d", {})
+    assert bool(model(batch).predictions.isfinite().all())
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("name", ["gru_d", "ode_gru_d", "anchored_ode_gru_d"])
-def test_what_a_step_records_is_freed_with_it(name, monkeypatch):
+def test_what_a_step_records_is_freed_with_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A record that its own outputs kept alive would take the memory of every step in turn."""
-    records = []
-
-    class Record(written_out._Record):
-        def __init__(self, *args):
-            super().__init__(*args)
-            records.append(weakref.ref(self))
-
-    monkeypatch.setattr(written_out, "_Record", Record)
     model, batch = made(name, {})
-    output = model(batch)
-    output.predictions.sum().backward()
-    assert records[0]() is not None
-    del output
+    rows, _ = model.facts(batch)
+    kept = weakref.ref(rows.gap)
+    predictions, *_ = model.run(rows)
+    predictions.sum().backward()
+    del rows
+    assert kept() is not None
+    del predictions, _
     gc.collect()
-    assert records[0]() is None
+    assert kept() is None
 
 
-def test_the_public_scan_carries_states_as_documented():
-    model, batch = made("gru", {})
-    seen = {}
-
-    def spy(*args):
-        seen["result"] = scan(*args)
-        return seen["result"]
-
-    recurrence_scan = recurrence.scan
-    try:
-        recurrence.scan = spy
-        output = model(batch)
-    finally:
-        recurrence.scan = recurrence_scan
-    before, after = seen["result"]
-    assert before.shape == after.shape == (batch.rows, len(batch), model.spec.state_size)
-    assert torch.equal(output.before, before.transpose(0, 1))
+def made(name: str, options: dict[str, Any]) -> tuple[ob.RecurrentModel, ob.Batch]:
+    data = dataset(5, seed=3)
+    model = draw_weights(ob.make(name, data, **{**SMALL, **options}))
+    return model, model.batch(data)

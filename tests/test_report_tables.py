@@ -14,7 +14,7 @@ from scipy import stats
 from offbeat.errors import InputError
 from offbeat.report import pairing, stability, tables, tables_beyond, tables_tests
 from offbeat.report import thesis_numbers as thesis
-from offbeat.report.table import DASH, MINUS, MIXED, Block, Cell, Table, bold_lowest
+from offbeat.report.table import MIXED, Block, Cell, Table, bold_lowest
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ SMALL = Table(
             (
                 (
                     "A < B",
-                    (Cell(f"{MINUS}1", -1.0, mark=MIXED), Cell("2", 2.0)),
+                    (Cell("−1", -1.0, mark=MIXED), Cell("2", 2.0)),
                 ),
             ),
         ),
@@ -111,8 +111,8 @@ def test_a_table_as_markdown():
     assert SMALL.to_markdown() == (
         "**Table A.1.** Errors, 90 % & more.\n\n"
         "| Model | 90 % | x_1 |\n|---|---|---|\n"
-        f"| *First* | | |\n| GRU | **0.1 ± 0.2** | {DASH} |\n"
-        f"| *Second* | | |\n| A < B | {MINUS}1† | 2 |\n"
+        "| *First* | | |\n| GRU | **0.1 ± 0.2** | – |\n"
+        "| *Second* | | |\n| A < B | −1† | 2 |\n"
         "\nA note.\n"
     )
 
@@ -135,7 +135,7 @@ def test_a_table_as_html_has_a_caption_header_cells_and_nothing_unescaped():
     assert '<th scope="col">90 %</th>' in html
     assert '<th scope="row">A &lt; B</th>' in html
     assert "<td><b>0.1 ± 0.2</b></td>" in html
-    assert f"<td>{MINUS}1<sup>†</sup></td>" in html
+    assert "<td>−1<sup>†</sup></td>" in html
 
 
 def test_a_row_of_the_wrong_length_is_refused():
@@ -203,7 +203,7 @@ def test_missing_repeats_are_counted_in_the_cell_and_named_below(record):
     table = tables.repeats_table(made.without(record, gone), repeats=6)
     block = rows_of(table, "Ours, honest scoring")
     assert block["GRU"][0].text.endswith(" (4 of 6)")
-    assert [cell.text for cell in block["GRU-D"]] == [DASH] * 4
+    assert [cell.text for cell in block["GRU-D"]] == ["–"] * 4
     (note,) = [n for n in table.notes if n.startswith("Not all runs")]
     assert "GRU at 90\N{THIN SPACE}%: 4 of 6" in note
     assert "GRU-D at 30\N{THIN SPACE}%: 0 of 6" in note
@@ -265,7 +265,7 @@ def test_table_3_8_takes_the_t_test_that_bartlett_chooses(record):
         assert block["Bartlett"][i].value == pytest.approx(stats.bartlett(a, b).pvalue)
         t = stats.ttest_ind(a, b, equal_var=equal).pvalue
         assert block["Two-sample t" if equal else "Welch's t"][i].value == pytest.approx(t)
-        assert block["Welch's t" if equal else "Two-sample t"][i].text == DASH
+        assert block["Welch's t" if equal else "Two-sample t"][i].text == "–"
 
 
 def test_paired_tests_are_corrected_over_the_shares(record):
@@ -283,7 +283,7 @@ def test_paired_tests_are_corrected_over_the_shares(record):
     cells = dict(table.blocks[0].rows)["Mean difference"]
     difference = rmse(record, "ode_gru_d", 0.3, "honest") - rmse(record, "ode_rnn", 0.3, "honest")
     assert cells[3].value == pytest.approx(difference.mean())
-    assert cells[3].text.startswith(f"{MINUS}0.00")
+    assert cells[3].text.startswith("−0.00")
 
 
 def test_a_table_of_pairs_says_how_many_lack_runs(record):
@@ -291,8 +291,8 @@ def test_a_table_of_pairs_says_how_many_lack_runs(record):
     pairs = pairing.family(part, "against_fair", "honest")
     table = tables_tests.family_table(part, {"x": pairs}, number="A.5", caption="c")
     rows = dict(table.blocks[0].rows)
-    assert [cell.text for cell in rows[f"ODE-RNN {MINUS} Fair GRU"]] == [DASH] * 4
-    assert all(cell.value is not None for cell in rows[f"ODE-RNN {MINUS} Fair GRU-D"])
+    assert [cell.text for cell in rows["ODE-RNN − Fair GRU"]] == ["–"] * 4
+    assert all(cell.value is not None for cell in rows["ODE-RNN − Fair GRU-D"])
     assert "(8)" in table.notes[-1]
 
 
@@ -363,7 +363,7 @@ def test_too_few_repeats_leave_tables_of_tests_empty_with_a_reason():
     record = made.synthetic(repeats=2, epochs=2, fractions=(0.3,), experiments=(2,))
     rules = {("ode_rnn", "honest"): pairing.thesis_rule(record, "honest")}
     table = tables_tests.rule_table(record, rules)
-    assert all(c.text == DASH for _, cells in table.blocks[1].rows for c in cells)
+    assert all(c.text == "–" for _, cells in table.blocks[1].rows for c in cells)
     assert "at least 3" in table.notes[-1]
     ranked = tables_tests.ranks_table(pairing.ranks(record, "honest"), number="A", scoring="honest")
     assert [block.heading for block in ranked.blocks] == ["Test"]

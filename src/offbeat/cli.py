@@ -15,10 +15,15 @@ from offbeat.commands.compare import compare_command
 from offbeat.commands.demo import demo_command
 from offbeat.commands.doctor import doctor_command
 from offbeat.commands.evaluate import evaluate_command
+from offbeat.commands.export import export_command
+from offbeat.commands.extrapolate import extrapolate_command
+from offbeat.commands.impute import impute_command
+from offbeat.commands.inspect import inspect_command
 from offbeat.commands.predict import predict_command
 from offbeat.commands.report import report_command
 from offbeat.commands.reproduce import reproduce_command
 from offbeat.commands.simulate import simulate_command
+from offbeat.commands.stream import stream_command
 from offbeat.commands.train import train_command
 from offbeat.errors import OffbeatError
 
@@ -31,6 +36,8 @@ A first way through, from simulation to a scored model:
       --model.name ode_rnn --training.epochs 5
   offbeat evaluate runs/ode_rnn hopper.parquet
   offbeat predict runs/ode_rnn hopper.parquet predictions.csv
+  offbeat impute runs/ode_rnn hopper.parquet filled.csv
+  offbeat extrapolate runs/ode_rnn hopper.parquet ahead.csv --horizons '[0.05, 0.1]'
 
 Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 
@@ -39,10 +46,15 @@ Or all of it at once, every model beside the trivial predictor: offbeat demo"""
 # lazy package `offbeat`, and import torch to look at them.
 COMMANDS: dict[str, Any] = {
     "simulate": simulate_command,
+    "inspect": inspect_command,
     "train": train_command,
     "evaluate": evaluate_command,
     "predict": predict_command,
     "compare": compare_command,
+    "stream": stream_command,
+    "export": export_command,
+    "impute": impute_command,
+    "extrapolate": extrapolate_command,
     "demo": demo_command,
     "reproduce": reproduce_command,
     "report": report_command,
@@ -51,6 +63,10 @@ COMMANDS: dict[str, Any] = {
 
 # Commands that take any number of paths, as a shell hands them over.
 MANY_PATHS = ("compare",)
+
+
+FLAGS = ("--json", "--stats", "--tiny")
+"""Options that need no value."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,11 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     from jsonargparse import ArgumentError, auto_cli
 
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
-    # A flag, although options made from bool arguments want a value.
-    arguments = [
-        f"{argument}=true" if argument in ("--json", "--tiny") else argument
-        for argument in arguments
-    ]
+    # Flags, although options made from bool arguments want a value.
+    arguments = [f"{argument}=true" if argument in FLAGS else argument for argument in arguments]
     if arguments == ["--version"]:
         from offbeat import __version__
 

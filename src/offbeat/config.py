@@ -135,26 +135,86 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 }
 
 
+HIDINGS = ("rows", "cells", "bursts", "dropout")
+"""Ways of hiding observed cells; `data.thin` says what each does."""
+
+CUTS = ("one", "consecutive", "random")
+"""Ways of cutting windows; `data.prepare.windows` says what each does."""
+
+SPLITS = ("by_trajectory", "in_time")
+"""Ways of sharing out data; `data.prepare.parts` says what each does."""
+
+
 @dataclass(frozen=True)
 class PartsConfig:
     """How recorded trajectories become a training, a validation and a test part.
 
     Attributes:
-        window: rows of the window cut out of each trajectory, its start drawn; None keeps all.
-        observed_fraction: share of the rows that stay observed; None hides nothing.
-        fractions: shares of training, validation and test trajectories; they sum to 1.
-        seed: of windows, hidden rows and split.
+        window: rows of a window; None, and no window_s, keeps trajectories whole.
+        window_s: length of a window in seconds, instead of in rows.
+        cut: `one` window out of each trajectory, its start drawn; `consecutive`, one after the
+            other, nothing left out; `random`, drawn for training, consecutive for the other parts.
+            By default `one`, and `consecutive` where the split is in time.
+        window_count: windows that `random` draws from each trajectory; by default as many as are
+            as long as the trajectory together.
+        observed_fraction: share of what was observed that stays observed; None hides nothing.
+        hide: `rows`, all channels together at random; `cells`, each channel on its own; `bursts`,
+            runs of rows; `dropout`, each sensor silent for spans of its own.
+        burst_rows: rows of a burst or of a silence; None, and no burst_s, makes it a single one.
+        burst_s: its length in seconds, instead of in rows.
+        sensors: channels that fall silent together in `dropout`, a list of names per sensor; by
+            default channels that were always observed together.
+        split: `by_trajectory`, at random; `in_time`, the first rows of the log train, those after
+            them validate, the last ones test, and no window straddles.
+        fractions: shares of training, validation and test, of the trajectories or of the rows; they
+            sum to 1.
+        seed: of windows, hiding and split.
     """
 
     window: int | None = None
+    window_s: float | None = None
+    cut: Literal["one", "consecutive", "random"] | None = None
+    window_count: int | None = None
     observed_fraction: float | None = None
+    hide: Literal["rows", "cells", "bursts", "dropout"] = "rows"
+    burst_rows: int | None = None
+    burst_s: float | None = None
+    sensors: tuple[tuple[str, ...], ...] | None = None
+    split: Literal["by_trajectory", "in_time"] = "by_trajectory"
     fractions: tuple[float, float, float] = (0.7, 0.15, 0.15)
     seed: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fractions", tuple(self.fractions))
-        _check(self, "window", lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        if self.sensors is not None:
+            object.__setattr__(self, "sensors", tuple(tuple(names) for names in self.sensors))
+        one_of("way of hiding", self.hide, HIDINGS)
+        one_of("split", self.split, SPLITS)
+        if self.cut is not None:
+            one_of("cut", self.cut, CUTS)
+        for name in ("window", "window_count", "burst_rows"):
+            _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        for name in ("window_s", "burst_s"):
+            _check(self, name, lambda v: 0 < v < math.inf, "a positive number of seconds")
+        for rows, seconds in (("window", "window_s"), ("burst_rows", "burst_s")):
+            if getattr(self, rows) is not None and getattr(self, seconds) is not None:
+                raise InputError(f"give {rows} or {seconds}, not both")
+        if self.window is None and self.window_s is None and self.cut is not None:
+            raise InputError(f"cut={self.cut!r} needs the length of a window: window or window_s")
+        if self.window_count is not None and self.cut != "random":
+            raise InputError("window_count is an option of cut='random'; leave it out")
         check_seed(self.seed)
+
+    @property
+    def hiding(self) -> dict[str, Any]:
+        """What `thin` is given beside the data and the seed."""
+        return {
+            "observed_fraction": self.observed_fraction,
+            "hide": self.hide,
+            "burst_rows": self.burst_rows,
+            "burst_s": self.burst_s,
+            "sensors": self.sensors,
+        }
 
 
 @dataclass(frozen=True)

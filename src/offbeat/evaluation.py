@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from offbeat.data.batch import last_index
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
+from offbeat.inference.scoring import ChannelScores
 from offbeat.models.recurrence import RecurrentModel
 from offbeat.scores import Scores, ScoreSums, last_value_predictions, table
 from offbeat.training import validate
@@ -27,6 +29,7 @@ class Evaluation:
         scaler: what the scaled units are: `standardise`, `divide_by_max`, ...
         channel_scale: per channel, one scaled unit in the channel's unit.
         trajectories: how many were scored.
+        channel_cells: per channel, how many cells were scored.
     """
 
     scores: Mapping[str, Scores]
@@ -35,6 +38,7 @@ class Evaluation:
     scaler: str
     channel_scale: tuple[float, ...]
     trajectories: int
+    channel_cells: tuple[int, ...]
 
     def table(self, *, notes: Mapping[str, str] | None = None) -> str:
         """A plain-text table of RMSE in scaled units, best honest score first."""
@@ -45,6 +49,18 @@ class Evaluation:
         mse = self.scores[predictor].honest.per_channel
         scales = zip(self.names, mse, self.channel_scale, strict=True)
         return {name: value**0.5 * abs(scale) for name, value, scale in scales}
+
+    def in_units(self) -> ChannelScores:
+        """The honest RMSE of every predictor, per channel in its unit, and who is best."""
+        return ChannelScores(
+            "one step ahead",
+            self.names,
+            self.units,
+            self.channel_cells,
+            {name: tuple(self.channel_rmse(name).values()) for name in self.scores},
+            {name: scores.honest.rmse for name, scores in self.scores.items()},
+            (LAST_VALUE,),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form, with the RMSE of each channel in its own unit."""
@@ -93,6 +109,7 @@ def evaluate(
                 "training means differ; train both on the same data, or evaluate them apart"
             )
     batch = first.batch(dataset)
+    honest = batch.known & batch.valid[..., None] & (last_index(batch.mask) >= 0)
     trivial = ScoreSums(batch.channels, gap_unit=first.statistics.median_gap)
     trivial.add(last_value_predictions(batch, first.mean), batch)
     scores = {name: validate(model, batch, seed=seed) for name, model in models.items()}
@@ -103,4 +120,5 @@ def evaluate(
         first.scaler.kind,
         tuple(first.scaler.scale.tolist()),
         len(dataset),
+        tuple(honest.sum(dim=(0, 1)).tolist()),
     )

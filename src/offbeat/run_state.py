@@ -8,6 +8,8 @@ import io
 import json
 import math
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from offbeat.config import TrainConfig
 from offbeat.data.batch import Batch
 from offbeat.errors import InputError
 from offbeat.files import write_text
+from offbeat.kernels import body
 from offbeat.models.checkpoint import load_training_state, save_training_state
 from offbeat.models.recurrence import RecurrentModel
 
@@ -48,16 +51,62 @@ class EpochRecord:
     seconds: float
 
 
+class FlatParameters:
+    """All parameters of a model as one, so that an optimizer's step is a few operations in all.
+
+    Attributes:
+        flat: every parameter, in the order of `model.parameters()`; its gradient is theirs.
+    """
+
+    def __init__(self, model: RecurrentModel) -> None:
+        self._own = list(model.parameters())
+        flat = torch.cat([p.detach().reshape(-1) for p in self._own])
+        self.flat = torch.nn.Parameter(flat)
+        self.gradient = torch.zeros_like(flat)
+        self.flat.grad = self.gradient
+        at = 0
+        for p in self._own:
+            end = at + p.numel()
+            p.data = flat[at:end].view_as(p)
+            p.grad = self.gradient[at:end].view_as(p)
+            at = end
+
+    def zero_gradient(self) -> None:
+        """Before a step; what a backward pass finds is added in place."""
+        self.gradient.zero_()
+
+    def release(self) -> None:
+        """Gives each parameter its own memory again."""
+        for p in self._own:
+            p.data = p.data.clone()
+            p.grad = None
+
+
+@contextmanager
+def flat_parameters(model: RecurrentModel) -> Iterator[FlatParameters]:
+    """Lets a model's parameters lie in one piece while it is trained.
+
+    Args:
+        model: whose parameters.
+    """
+    parameters = FlatParameters(model)
+    try:
+        yield parameters
+    finally:
+        parameters.release()
+
+
 class RunState:
     """All of a training run that changes, beside the model: what a checkpoint must hold.
 
     Args:
-        model: its parameters are what the optimizer moves.
+        parameters: what the optimizer moves.
         config: names the optimizer.
     """
 
-    def __init__(self, model: RecurrentModel, config: TrainConfig) -> None:
-        self.optimizer = _optimizer(model, config)
+    def __init__(self, parameters: FlatParameters, config: TrainConfig) -> None:
+        self.parameters = parameters
+        self.optimizer = _optimizer(parameters.flat, config)
         self.epoch = 0  # epochs done
         self.step = 0  # steps done within the epoch
         self.total_steps = 0
@@ -69,7 +118,7 @@ class RunState:
         self.best: dict[str, Tensor] = {}
 
 
-def _optimizer(model: RecurrentModel, config: TrainConfig) -> torch.optim.Optimizer:
+def _optimizer(flat: torch.nn.Parameter, config: TrainConfig) -> torch.optim.Optimizer:
     kinds: dict[str, Any] = {
         "adamax": torch.optim.Adamax,
         "adam": torch.optim.Adam,
@@ -77,7 +126,7 @@ def _optimizer(model: RecurrentModel, config: TrainConfig) -> torch.optim.Optimi
         "sgd": torch.optim.SGD,
     }
     optimizer: torch.optim.Optimizer = kinds[config.optimizer](
-        model.parameters(), lr=config.learning_rate, foreach=True
+        [flat], lr=config.learning_rate, foreach=True
     )
     return optimizer
 
@@ -119,9 +168,8 @@ def save_run(
         identity: from `identity_of`.
     """
     tensors = {f"best.{k}": v for k, v in state.best.items()}
-    for i, parameter in enumerate(model.parameters()):
-        for name, value in state.optimizer.state.get(parameter, {}).items():
-            tensors[f"optimizer.{i}.{name}"] = torch.as_tensor(value)
+    for name, value in state.optimizer.state.get(state.parameters.flat, {}).items():
+        tensors[f"optimizer.{name}"] = torch.as_tensor(value)
     facts = {
         "identity": identity,
         "epoch": state.epoch,
@@ -136,6 +184,7 @@ def save_run(
             for record in state.history
         ],
         "torch_threads": torch.get_num_threads(),
+        "scan_body": body()[0],
     }
     checkpoints = folder / "checkpoints"
     name = f"steps-{state.total_steps:09d}"
@@ -178,11 +227,10 @@ def resume_run(
                 f" ({part}); give the same, or another folder"
             )
     model.load_state_dict(weights)
-    for i, parameter in enumerate(model.parameters()):
-        prefix = f"optimizer.{i}."
-        values = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
-        if values:
-            state.optimizer.state[parameter] = values
+    prefix = "optimizer."
+    moments = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
+    if moments:
+        state.optimizer.state[state.parameters.flat] = moments
     state.best = {k[len("best.") :]: v for k, v in tensors.items() if k.startswith("best.")}
     for name in ("epoch", "step", "total_steps", "loss_sum", "seconds", "best_epoch"):
         setattr(state, name, facts[name])

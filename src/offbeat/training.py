@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn.functional import mse_loss
 from tqdm import tqdm
 
 from offbeat.config import TrainConfig
@@ -19,9 +21,19 @@ from offbeat.data.batch import Batch
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
 from offbeat.files import writable
+from offbeat.kernels import RowTable
+from offbeat.kernels.fused import own_threads
 from offbeat.models.checkpoint import save_checkpoint
 from offbeat.models.recurrence import RecurrentModel
-from offbeat.run_state import EpochRecord, RunState, identity_of, resume_run, save_run, write_log
+from offbeat.run_state import (
+    EpochRecord,
+    RunState,
+    flat_parameters,
+    identity_of,
+    resume_run,
+    save_run,
+    write_log,
+)
 from offbeat.scores import Scores, ScoreSums
 
 
@@ -81,7 +93,19 @@ def fit(
     folder = writable(out, folder=True) if out is not None else None
     batch = model.batch(train)
     held_out = model.batch(validation) if validation is not None else None
-    state = RunState(model, config)
+    with flat_parameters(model) as parameters, threads_for(model):
+        return _fit(model, batch, held_out, config, RunState(parameters, config), folder, progress)
+
+
+def _fit(
+    model: RecurrentModel,
+    batch: Batch,
+    held_out: Batch | None,
+    config: TrainConfig,
+    state: RunState,
+    folder: Path | None,
+    progress: bool,
+) -> FitResult:
     identity = identity_of(model, config, batch)
     if folder is not None:
         resume_run(folder, model, state, identity)
@@ -90,11 +114,12 @@ def fit(
                 f"{folder} holds a run of {state.epoch} epochs already, {config.epochs} were asked "
                 "for; give another folder"
             )
+    examples = Examples(model, batch)
     stopped = _stopped(state, config)
     writer = _tensorboard(folder, state)
     with _progress_bar(state, config, len(batch), progress) as bar:
         while state.epoch < config.epochs and not stopped:
-            _epoch(model, batch, state, config, bar, folder, identity)
+            _epoch(model, examples, state, config, bar, folder, identity)
             _close_epoch(model, batch, held_out, state, config)
             record = state.history[-1]
             bar.set_postfix_str(_postfix(record))
@@ -135,23 +160,63 @@ def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 
 # --- one epoch ------------------------------------------------------------------------------------
 
 
+class Examples:
+    """A training part in memory, as a step takes it: nothing is made anew from epoch to epoch.
+
+    Args:
+        model: its scales and statistics make the facts of the rows.
+        batch: scaled.
+    """
+
+    def __init__(self, model: RecurrentModel, batch: Batch) -> None:
+        with torch.no_grad():
+            rows, _ = model.facts(batch)
+        self.table = RowTable.of(rows)
+        # Flat, and without the first row: long runs of memory are quick to compare.
+        self.targets = batch.values[:, 1:].flatten(1).contiguous()
+        counted = (batch.known & batch.valid[..., None])[:, 1:].flatten(1)
+        self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def loss(self, model: RecurrentModel, index: Tensor, coins: torch.Generator | None) -> Tensor:
+        """Mean squared error of the one-step-ahead prediction of some trajectories.
+
+        Args:
+            model: as it stands.
+            index: (batch,) positions of the trajectories.
+            coins: generator of the coins of self-feeding.
+        """
+        rows = self.table.take(index)
+        predictions = model.run(rows, coins=coins)[0].flatten(1)[:, model.channels :]
+        cells = predictions.shape[1]
+        targets = self.targets.index_select(0, index)[:, :cells]
+        if self.counted is None and cells:
+            return mse_loss(predictions, targets)
+        counted = torch.ones_like(targets)
+        if self.counted is not None:
+            counted = self.counted.index_select(0, index)[:, :cells]
+        return ((predictions - targets).square() * counted).sum() / counted.sum().clamp_min(1)
+
+
 def _epoch(
     model: RecurrentModel,
-    batch: Batch,
+    examples: Examples,
     state: RunState,
     config: TrainConfig,
     bar: Any,
     folder: Path | None,
     identity: dict[str, Any],
 ) -> None:
-    order = np.random.default_rng([config.seed, state.epoch]).permutation(len(batch))
-    steps = math.ceil(len(batch) / config.batch_size)
+    order = np.random.default_rng([config.seed, state.epoch]).permutation(len(examples))
+    steps = math.ceil(len(examples) / config.batch_size)
     started = time.perf_counter()
     done_before = state.seconds
     while state.step < steps:
         first = state.step * config.batch_size
-        part = batch.take(torch.from_numpy(order[first : first + config.batch_size]))
-        loss = _step(model, part, state, config, total=steps * config.epochs)
+        index = torch.from_numpy(order[first : first + config.batch_size])
+        loss = train_step(model, examples, index, state, config, total=steps * config.epochs)
         state.loss_sum += loss
         state.step += 1
         state.total_steps += 1
@@ -167,27 +232,54 @@ def _epoch(
     state.seconds = done_before + time.perf_counter() - started
 
 
-def _step(
-    model: RecurrentModel, part: Batch, state: RunState, config: TrainConfig, *, total: int
+@contextmanager
+def threads_for(model: RecurrentModel) -> Iterator[None]:
+    """Within a `with` block, the threads go to whatever does the work of training a model.
+
+    Args:
+        model: one that the fused body runs leaves torch with one thread.
+    """
+    with own_threads() if model.runs_fused() else nullcontext():
+        yield
+
+
+def train_step(
+    model: RecurrentModel,
+    examples: Examples,
+    index: Tensor,
+    state: RunState,
+    config: TrainConfig,
+    *,
+    total: int,
 ) -> float:
+    """Takes one optimizer step on some trajectories; returns the loss before it.
+
+    Args:
+        model: trained in place.
+        examples: of the training part.
+        index: (batch,) positions of the trajectories.
+        state: optimizer and counters.
+        config: learning rate, clipping and the rest.
+        total: steps of the whole training, for a schedule.
+
+    Raises:
+        DivergenceError: the loss is not finite.
+    """
     coins = None
     if model.config.self_feeding:
         seed = np.random.default_rng([config.seed, state.epoch, state.step]).integers(2**62)
         coins = torch.Generator().manual_seed(int(seed))
-    counted = part.known & part.valid[..., None]
-    error = model(part, coins=coins).predictions[:, 1:] - part.values[:, 1:]
-    counted = counted[:, 1:]
-    loss = (error.square() * counted).sum() / counted.sum().clamp_min(1)
+    loss = examples.loss(model, index, coins)
     value = float(loss.detach())
     if not math.isfinite(value):
         raise DivergenceError(
             f"the loss turned to {value} in epoch {state.epoch + 1}, step {state.step + 1}; the "
             "last good checkpoint is kept: lower the learning rate, or clip gradients (clip_norm)"
         )
-    state.optimizer.zero_grad(set_to_none=True)
-    (loss * config.loss_scale).backward()
+    state.parameters.zero_gradient()
+    (loss * config.loss_scale).backward()  # type: ignore[no-untyped-call]
     if config.clip_norm is not None:
-        torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm, foreach=True)
+        torch.nn.utils.clip_grad_norm_([state.parameters.flat], config.clip_norm)
     if config.schedule == "cosine":
         rate = 0.5 * config.learning_rate * (1 + math.cos(math.pi * state.total_steps / total))
         for group in state.optimizer.param_groups:

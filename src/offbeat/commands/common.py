@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from offbeat.errors import FileFormatError, InputError, one_of
+
+if TYPE_CHECKING:
+    from offbeat.data.trajectory import Dataset
+
+READER_FILE = "reader.json"
+"""Where a run keeps the options that its log was read with."""
 
 
 def say(result: Any, text: str, as_json: bool) -> None:
@@ -13,4 +23,118 @@ def say(result: Any, text: str, as_json: bool) -> None:
 
 def plain(config: dict[str, Any]) -> dict[str, Any]:
     """The fields of a config as JSON and YAML know them."""
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in config.items()}
+    return {k: _lists(v) for k, v in config.items()}
+
+
+def _lists(value: Any) -> Any:
+    return [_lists(v) for v in value] if isinstance(value, tuple) else value
+
+
+def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = None) -> Dataset:
+    """Reads a log of any known format.
+
+    Args:
+        data: the file.
+        reader: options of `offbeat.read`: `format`, and those of the format; None takes those that
+            the run was trained with.
+        run: folder of a run.
+
+    Raises:
+        FileFormatError: as `read`, or the options of the run are damaged.
+        InputError: as `read`.
+    """
+    from offbeat.data.readers import read
+
+    if reader is None and run is not None and (run / READER_FILE).is_file():
+        try:
+            reader = dict(json.loads((run / READER_FILE).read_text(encoding="utf-8")))
+        except (TypeError, ValueError) as error:
+            raise FileFormatError(
+                f"{run / READER_FILE} is damaged ({error}); give --reader"
+            ) from None
+    return read(data, **(reader or {}))
+
+
+def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) -> dict[str, Any]:
+    """The table that commands write: times, one column per channel, and what was observed of it.
+
+    Args:
+        dataset: as it was read; its labels and its clock are put back.
+        answers: one trajectory per trajectory of the data set.
+        masks: add a column `name|observed` per channel: true where the value was measured, false
+            where it was filled or predicted.
+
+    Raises:
+        InputError: a channel has the name of another column.
+    """
+    import numpy as np
+
+    from offbeat.data.trajectory import SECONDS_PER
+
+    each = [t.rows for t in answers]
+    labels = np.asarray(dataset.meta.get("labels", range(len(answers))))
+    seconds = np.concatenate([t.times for t in answers])
+    columns: dict[str, Any] = {"trajectory": np.repeat(labels, each), "time": seconds}
+    if "clock_start" in dataset.meta:
+        # An integer clock was read relative to its first row; this puts it back, to the tick.
+        unit, start = dataset.meta["time_unit"], np.repeat(dataset.meta["clock_start"], each)
+        ticks = seconds / SECONDS_PER[unit]
+        columns[f"clock_{unit}"] = start + (ticks if unit == "s" else np.rint(ticks).astype(int))
+    values = np.concatenate([t.values for t in answers])
+    added = {name: values[:, i] for i, name in enumerate(answers.names)}
+    if masks:
+        observed = np.concatenate([t.observed for t in answers])
+        added |= {f"{name}|observed": observed[:, i] for i, name in enumerate(answers.names)}
+    taken = [name for name in added if name in columns]
+    if taken or len(added) < answers.channels * (2 if masks else 1):
+        twice = taken[0] if taken else next(n for n in answers.names if n.endswith("|observed"))
+        raise InputError(f"a channel is called {twice!r}, as another column is; rename it")
+    return {**columns, **added}
+
+
+def check_out(out: Path, data: Path) -> None:
+    """Checks where a table is to be written.
+
+    Raises:
+        InputError: it is no .csv or .parquet file, or the data itself.
+    """
+    one_of("suffix of out", out.suffix, (".csv", ".parquet"))
+    if out.exists() and data.exists() and out.samefile(data):
+        raise InputError(f"{out} is the data set itself; give another file")
+
+
+def check_figure(figure: Path | None) -> None:
+    """Checks where a figure is to be written, before anything is computed.
+
+    Raises:
+        InputError: it is no .png, .pdf or .svg file, or can't be written there.
+    """
+    from offbeat.files import writable
+
+    if figure is not None:
+        one_of("suffix of figure", figure.suffix.lower(), (".png", ".pdf", ".svg"))
+        writable(figure)
+
+
+def drawn_channels(names: Sequence[str], asked: Sequence[str] | None) -> list[str]:
+    """The channels of a figure: those asked for, or the first four.
+
+    Raises:
+        InputError: a channel is asked for that is not there.
+    """
+    if asked is None:
+        return list(names[:4])
+    return [one_of("channel", name, names) for name in asked]
+
+
+def one_trajectory(dataset: Dataset, number: int) -> int:
+    """Returns the number of a trajectory, counted from 0.
+
+    Raises:
+        InputError: there is no such trajectory.
+    """
+    if not 0 <= number < len(dataset):
+        raise InputError(
+            f"there is no trajectory {number}; the data has {len(dataset)}, counted from 0"
+        )
+    return number

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from offbeat.commands.common import say
-from offbeat.config import check_seed
+from offbeat.commands.common import (
+    check_figure,
+    drawn_channels,
+    one_trajectory,
+    read_log,
+    say,
+)
+from offbeat.config import HIDINGS, check_seed
 from offbeat.errors import InputError, one_of
 
 
@@ -14,35 +21,61 @@ def evaluate_command(
     data: Path,
     part: str | None = None,
     observed_fraction: float | None = None,
+    hide: str = "rows",
+    burst_rows: int | None = None,
+    burst_s: float | None = None,
+    horizons: list[float] | float | None = None,
     out: Path | None = None,
+    figure: Path | None = None,
+    channels: list[str] | None = None,
+    trajectory: int = 0,
+    reader: dict[str, Any] | None = None,
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Score a trained model beside the last observed value.
+    """Score a trained model beside trivial predictors.
+
+    One step ahead, beside the last observed value. Where cells are hidden, filling them, beside
+    last value, linear interpolation and PCHIP. At horizons, if they are given, beside last value
+    and constant velocity. Errors are in the channels' units and, over all channels, in scaled ones.
 
     Args:
         model: folder of a run or of a checkpoint.
-        data: data set (.parquet) or CSV.
+        data: the log, of any format that Offbeat reads.
         part: test, validation, train or all. On the data that the run was trained on, the same
             windows, hidden rows and split are made again, and test is the default; other data can
             only be scored as a whole.
-        observed_fraction: hide rows of other data at random, this share stays observed.
+        observed_fraction: hide cells of other data at random, this share stays observed.
+        hide: how: rows, cells, bursts or dropout.
+        burst_rows: rows of a burst or of a silence.
+        burst_s: its length in s, instead.
+        horizons: s, to score extrapolation at: --horizons 0.5 or --horizons '[0.1, 0.5]'.
         out: JSON file for the scores.
+        figure: .png, .pdf or .svg of one trajectory, its hidden cells and what fills them.
+        channels: to draw; by default the first four.
+        trajectory: to draw, counted from 0 within the part.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; by default
+            those of the run.
         seed: of hidden rows and coins.
         json: print the scores as JSON.
     """
+    from offbeat.commands.scored import fill_figure, scored
     from offbeat.data.prepare import load_parts
-    from offbeat.data.readers import read
     from offbeat.data.thin import thin
     from offbeat.evaluation import evaluate
     from offbeat.files import write_json
-    from offbeat.models.checkpoint import load_checkpoint
+    from offbeat.inference.extrapolate import checked_horizons
+    from offbeat.inference.impute import load_run
+    from offbeat.inference.two_sided import TwoSided
 
     if part is not None:
         one_of("part", part, ("train", "validation", "test", "all"))
     check_seed(seed)
-    loaded = load_checkpoint(model)
-    dataset = read(data)
+    one_of("way of hiding", hide, HIDINGS)
+    check_figure(figure)
+    after = None if horizons is None else checked_horizons(horizons).tolist()
+    loaded = load_run(model)
+    dataset = read_log(data, reader, run=model)
     own = load_parts(model / "parts.json", dataset)
     if own is None and part not in (None, "all"):
         raise InputError(
@@ -60,12 +93,26 @@ def evaluate_command(
     else:
         part = "all"
         if observed_fraction is not None:
-            dataset = thin(dataset, observed_fraction, seed=seed)
-    evaluation = evaluate(loaded, dataset, seed=seed)
-    result = {"part": part, **evaluation.to_dict()}
+            dataset = thin(
+                dataset,
+                observed_fraction,
+                hide=hide,  # type: ignore[arg-type]
+                burst_rows=burst_rows,
+                burst_s=burst_s,
+                seed=seed,
+            )
+    forward = loaded.forward if isinstance(loaded, TwoSided) else loaded
+    chosen = drawn_channels(forward.names, channels)
+    one_trajectory(dataset, trajectory)
+    evaluation = evaluate(forward, dataset, seed=seed)
+    scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)
+    result = {"part": part, **scores}
     if out is not None:
         write_json(out, result)
     heading = (
         f"RMSE in scaled units ({evaluation.scaler}), part: {part}, {len(dataset)} trajectories"
     )
-    say(result, f"{heading}\n{evaluation.table()}", json)
+    if figure is not None:
+        fill_figure(loaded, dataset, figure, chosen, trajectory, seed=seed)
+        result["figure"] = str(figure)
+    say(result, f"{heading}\n{text}", json)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from offbeat.commands.common import plain, say
+from offbeat.commands.common import READER_FILE, plain, read_log, say
 from offbeat.config import ModelConfig, PartsConfig, TrainConfig, check_seed
 from offbeat.errors import InputError, one_of
+
+LONG = 2000
+"""Rows of a training trajectory from which on it is worth a word that windows train faster."""
 
 
 def train_command(
@@ -17,6 +22,8 @@ def train_command(
     training: TrainConfig = TrainConfig(),  # noqa: B008
     parts: PartsConfig = PartsConfig(),  # noqa: B008
     scaler: str = "standardise",
+    two_sided: bool = False,
+    reader: dict[str, Any] | None = None,
     seed: int = 0,
     threads: int = 1,
     json: bool = False,
@@ -24,13 +31,16 @@ def train_command(
     """Train a model on a data set, and score it on the part that was held out.
 
     Args:
-        data: data set (.parquet) or CSV.
+        data: the log, of any format that Offbeat reads.
         out: folder of the run: config.yaml, log.csv, checkpoints, model, results.json. A run that
             was stopped goes on where it was.
         model: what the model consists of; only the name is needed.
         training: epochs, optimizer and the rest.
-        parts: windows, hidden rows, and the split into training, validation and test.
+        parts: windows, hidden cells, and the split into training, validation and test.
         scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
+        two_sided: train a second model on reversed trajectories, too, so that impute can fill from
+            both sides; it lies in the folder backward of the run.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
         json: print the scores as JSON.
@@ -38,11 +48,14 @@ def train_command(
     import torch
     import yaml
 
+    from offbeat.commands.scored import scored
     from offbeat.data.prepare import SCALERS, save_parts
     from offbeat.data.prepare import parts as cut
-    from offbeat.data.readers import read
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
+    from offbeat.inference.impute import fit_two_sided
+    from offbeat.inference.two_sided import TwoSided
+    from offbeat.models.recurrence import RecurrentModel
     from offbeat.models.zoo import make
     from offbeat.training import fit
 
@@ -52,8 +65,15 @@ def train_command(
         raise InputError(f"threads must be an integer of at least 1, got {threads}")
     writable(out, folder=True)
     torch.set_num_threads(threads)
-    dataset = read(data)
+    dataset = read_log(data, reader)
     train_part, validation, test = cut(dataset, parts)
+    longest = max(t.rows for t in train_part)
+    if longest > LONG:
+        print(
+            f"offbeat: note: training trajectories have up to {longest} rows, each step goes "
+            "through all of them; windows train faster: --parts.window 200 --parts.cut random",
+            file=sys.stderr,
+        )
     made = make(model, train_part, scaler=scaler, seed=seed)  # type: ignore[arg-type]
     resolved = {
         "data": str(data),
@@ -62,14 +82,25 @@ def train_command(
         "training": plain(asdict(training)),
         "parts": plain(asdict(parts)),
         "scaler": scaler,
+        "two_sided": two_sided,
+        "reader": reader,
         "seed": seed,
         "threads": threads,
     }
-    fitted = fit(made, train_part, validation, training, out=out)
+    trained: RecurrentModel | TwoSided = made
+    if two_sided:
+        trained, fitted, _ = fit_two_sided(
+            made, train_part, validation, training, out=out, seed=seed
+        )
+    else:
+        fitted = fit(made, train_part, validation, training, out=out)
     write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
     save_parts(out / "parts.json", parts, dataset)
+    if reader:
+        write_json(out / READER_FILE, reader)
     evaluation = evaluate(made, test)
-    result = {"steps": fitted.steps, "part": "test", **evaluation.to_dict()}
+    scores, text = scored(trained, test, evaluation)
+    result = {"steps": fitted.steps, "part": "test", **scores}
     write_json(out / "results.json", result)
     heading = f"{out}: {fitted.steps} steps; RMSE on the test part, in scaled units ({scaler})"
-    say(result, f"{heading}\n{evaluation.table()}", json)
+    say(result, f"{heading}\n{text}", json)

@@ -1,10 +1,10 @@
-"""From recorded trajectories to what models are trained on: windows, splits, scales."""
+"""From recorded trajectories to what models are trained on: parts, splits, scales."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,36 +13,14 @@ from numpy.typing import NDArray
 
 from offbeat.config import PartsConfig, from_mapping
 from offbeat.data.thin import thin
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.windows import Cut, owned_windows
+from offbeat.data.windows import windows as windows
 from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.files import write_json
 
 ScalerKind = Literal["standardise", "min_max", "divide_by_max", "identity"]
 SCALERS: tuple[str, ...] = ("standardise", "min_max", "divide_by_max", "identity")
-
-
-def windows(dataset: Dataset, length: int, *, seed: int = 0) -> Dataset:
-    """Cuts one window of consecutive rows out of each trajectory, its start drawn uniformly.
-
-    Args:
-        dataset: trajectories of at least `length` rows each.
-        length: rows of a window.
-        seed: of the draw.
-
-    Raises:
-        InputError: `length` is below 1 or a trajectory is shorter.
-    """
-    random = np.random.default_rng(seed)
-    cut = []
-    for i, trajectory in enumerate(dataset):
-        if not 1 <= length <= trajectory.rows:
-            raise InputError(
-                f"a window of {length} rows does not fit into trajectory {i} of "
-                f"{trajectory.rows} rows; use a length from 1 to {trajectory.rows}"
-            )
-        start = int(random.integers(0, trajectory.rows - length + 1))
-        cut.append(trajectory.slice(start, start + length))
-    return Dataset(tuple(cut), {**dataset.meta, "window": length})
 
 
 def split(
@@ -64,24 +42,55 @@ def split(
     Raises:
         InputError: fractions are not positive or do not sum to 1, or a part would be empty.
     """
-    shares = np.asarray(fractions, dtype=float)
-    if shares.ndim != 1 or not (shares > 0).all() or not abs(shares.sum() - 1) <= 1e-9:
-        raise InputError(f"fractions must be positive and sum to 1, got {list(fractions)}")
-    ends = np.floor(np.cumsum(shares) * len(dataset) + 0.5).astype(int)
-    starts = np.concatenate([[0], ends[:-1]])
-    if (ends <= starts).any():
+    return tuple(dataset.take(index) for index in _shares(len(dataset), fractions, seed))
+
+
+def split_in_time(
+    dataset: Dataset, fractions: Sequence[float] = (0.7, 0.15, 0.15)
+) -> tuple[Dataset, ...]:
+    """Splits a log in time: its first rows are the first part, and so on.
+
+    Several trajectories count as one log, one after the other; the one in which a part ends is cut
+    there. A single row that is left of it is dropped.
+
+    Args:
+        dataset: a log, its trajectories in the order of time.
+        fractions: one per part, of the rows; they sum to 1.
+
+    Returns:
+        One data set per fraction.
+
+    Raises:
+        InputError: fractions are not positive or do not sum to 1, or a part would be empty.
+    """
+    rows = sum(t.rows for t in dataset)
+    ends = _ends(rows, fractions)
+    pieces: list[list[Trajectory]] = [[] for _ in ends]
+    before = 0
+    for trajectory in dataset:
+        start = 0
+        for part, end in zip(pieces, ends, strict=True):
+            stop = min(max(int(end) - before, start), trajectory.rows)
+            if stop - start >= 2:
+                part.append(trajectory.slice(start, stop))
+            start = stop
+        before += trajectory.rows
+    if not all(pieces):
         raise InputError(
-            f"{len(dataset)} trajectories are too few for the fractions {list(fractions)}: a part "
-            "would be empty; use more trajectories or fewer parts"
+            f"{rows} rows are too few to be split in time into {list(fractions)}: a part would be "
+            "empty; use a longer log or fewer parts"
         )
-    order = np.random.default_rng(seed).permutation(len(dataset))
-    return tuple(
-        dataset.take(np.sort(order[start:end])) for start, end in zip(starts, ends, strict=True)
-    )
+    return tuple(replace(dataset, trajectories=tuple(part)) for part in pieces)
 
 
 def parts(dataset: Dataset, config: PartsConfig) -> tuple[Dataset, Dataset, Dataset]:
-    """Windows, hidden rows and split, in this order, all from one seed.
+    """Windows, hiding and split, all from one seed.
+
+    By trajectory, all windows of a trajectory stand in one part. In time, the log is split before
+    all else, so that no window straddles. Where each trajectory gives one window, cells are hidden
+    in the windows; where it gives several, they are hidden before it is cut, so that shares hold
+    for the trajectory, or for its part in time. `random` windows are for training: validation and
+    test are cut consecutively, so that each of their rows counts once.
 
     Args:
         dataset: as recorded.
@@ -91,14 +100,56 @@ def parts(dataset: Dataset, config: PartsConfig) -> tuple[Dataset, Dataset, Data
         Training, validation and test part.
 
     Raises:
-        InputError: as `windows`, `thin` and `split`.
+        InputError: as `windows`, `thin`, `split` and `split_in_time`.
     """
-    if config.window is not None:
-        dataset = windows(dataset, config.window, seed=config.seed)
-    if config.observed_fraction is not None:
-        dataset = thin(dataset, config.observed_fraction, seed=config.seed)
-    train, validation, test = split(dataset, config.fractions, seed=config.seed)
+    if config.split == "in_time":
+        in_time = split_in_time(dataset, config.fractions)
+        dataset = replace(dataset, trajectories=tuple(t for part in in_time for t in part))
+        ends = np.cumsum([len(part) for part in in_time])
+        shares = np.split(np.arange(len(dataset)), ends[:-1])
+    else:
+        shares = _shares(len(dataset), config.fractions, config.seed)
+    cut: Cut = config.cut or ("consecutive" if config.split == "in_time" else "one")
+    owners = np.arange(len(dataset))
+    if config.observed_fraction is not None and cut != "one":
+        dataset = thin(dataset, seed=config.seed, **config.hiding)
+    if config.window is not None or config.window_s is not None:
+        held_out: Cut = "consecutive" if cut == "random" else cut
+        dataset, owners = owned_windows(
+            dataset,
+            config.window,
+            seconds=config.window_s,
+            cuts=[cut if i in shares[0] else held_out for i in range(len(dataset))],
+            count=config.window_count,
+            seed=config.seed,
+        )
+    if config.observed_fraction is not None and cut == "one":
+        dataset = thin(dataset, seed=config.seed, **config.hiding)
+    train, validation, test = (
+        dataset.take(np.flatnonzero(np.isin(owners, index))) for index in shares
+    )
     return train, validation, test
+
+
+def _shares(count: int, fractions: Sequence[float], seed: int) -> list[NDArray[np.int64]]:
+    """Positions of the trajectories of each part."""
+    ends = _ends(count, fractions)
+    starts = np.concatenate([[0], ends[:-1]])
+    if (ends <= starts).any():
+        raise InputError(
+            f"{count} trajectories are too few for the fractions {list(fractions)}: a part "
+            "would be empty; use more trajectories or fewer parts, or split a long log in time "
+            "(split='in_time')"
+        )
+    order = np.random.default_rng(seed).permutation(count)
+    return [np.sort(order[start:end]) for start, end in zip(starts, ends, strict=True)]
+
+
+def _ends(count: int, fractions: Sequence[float]) -> NDArray[np.int64]:
+    shares = np.asarray(fractions, dtype=float)
+    if shares.ndim != 1 or not (shares > 0).all() or not abs(shares.sum() - 1) <= 1e-9:
+        raise InputError(f"fractions must be positive and sum to 1, got {list(fractions)}")
+    return np.floor(np.cumsum(shares) * count + 0.5).astype(np.int64)
 
 
 def save_parts(path: str | Path, config: PartsConfig, dataset: Dataset) -> None:

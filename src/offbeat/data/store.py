@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.schema import METADATA_KEY, Schema
+from offbeat.data.source import require_file
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError
 from offbeat.files import atomic_path
@@ -98,32 +99,6 @@ def holds_data_set(path: str | Path) -> bool:
         return METADATA_KEY in (pq.read_schema(path).metadata or {})
     except (pa.ArrowException, OSError, UnicodeDecodeError):
         return False
-
-
-def require_file(path: str | Path) -> Path:
-    """Returns the path of a file that is there, is not empty, and is not a stand-in for another.
-
-    Raises:
-        FileFormatError: it is missing, a folder, empty, or a Git LFS pointer.
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise FileFormatError(f"{path} is a folder, expected a file; name the file inside it")
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError as error:
-        raise FileFormatError(
-            f"{path} can't be read ({error.strerror}); check the path, working directory is "
-            f"{Path.cwd()}"
-        ) from None
-    if not start:
-        raise FileFormatError(f"{path} is empty, expected a data set; write it again")
-    if start.startswith(b"version https://git-lfs"):
-        raise FileFormatError(
-            f"{path} is a Git LFS pointer, not the data; fetch the data with: git lfs pull"
-        )
-    return path
 
 
 def _row_groups(dataset: Dataset, schema: Schema) -> Iterator[dict[str, NDArray[Any]]]:

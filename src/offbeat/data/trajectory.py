@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from offbeat.errors import InputError, one_of
 
-SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
 """Units of time that input may be given in; inside, times are seconds."""
 
 
@@ -78,14 +78,15 @@ class Trajectory:
                 f"values{where} are infinite at row {row}, channel {names[channel]!r}; "
                 "use NaN for a cell that is not known"
             )
-        known = ~np.isnan(values)
+        known = np.isnan(values)
+        np.logical_not(known, out=known)
         observed = known if self.observed is None else np.asarray(self.observed)
         if observed.dtype != np.bool_ or observed.shape != values.shape:
             raise InputError(
                 f"observed{where} must be bool of shape {values.shape}, as values has, got "
                 f"{observed.dtype} of shape {observed.shape}"
             )
-        if (observed & ~known).any():
+        if observed is not known and (observed & ~known).any():
             row, channel = np.argwhere(observed & ~known)[0]
             raise InputError(
                 f"observed{where} is True at row {row}, channel {names[channel]!r}, where the "
@@ -125,7 +126,7 @@ class Trajectory:
         Args:
             times: (rows,) in `time_unit`.
             values: (rows, channels) NaN where not known.
-            time_unit: one of `s`, `ms`, `us`, `ns`.
+            time_unit: one of `s`, `ms`, `us`, `100ns` (ticks of Windows), `ns`.
             **fields: the other fields of `Trajectory`.
 
         Raises:

@@ -158,9 +158,10 @@ def _take_up(folder: Path, config: dict[str, Any]) -> float:
 
 def _comparable(kept: Any, keys: Iterable[str]) -> dict[str, Any]:
     """What must be the same for a run to go on: all but the commit, which is a name."""
-    part = {key: kept.get(key) for key in keys} if isinstance(kept, dict) else {}
-    if isinstance(part.get("provenance"), dict):
-        part["provenance"] = {k: v for k, v in part["provenance"].items() if k != "commit"}
+    part: dict[str, Any] = {key: kept.get(key) for key in keys} if isinstance(kept, dict) else {}
+    made = part.get("provenance")
+    if isinstance(made, dict):
+        part["provenance"] = {k: v for k, v in made.items() if k != "commit"}
     return part
 
 

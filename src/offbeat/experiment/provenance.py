@@ -33,6 +33,9 @@ NUMBERS_FROM = (
 )
 """Files and folders of the package that a run's numbers depend on, given the recorded data."""
 
+_LIVE_ONLY = ("live.hpp", "stream.hpp")
+"""C++ that runs streams and no training."""
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -67,7 +70,9 @@ def _here() -> Provenance:
 
 def kernel_body() -> str:
     """Which body of `kernels.scan` runs here."""
-    return "written_out/reference"
+    from offbeat.kernels import body
+
+    return body()[0]
 
 
 def commit() -> str:
@@ -101,7 +106,7 @@ def code(package: Path = PACKAGE) -> str:
         files += sorted(path.rglob("*.py")) if path.is_dir() else [path]
     root = package.parents[1]
     if (root / "src" / package.name) == package:
-        files += sorted(p for p in (root / "csrc").rglob("*") if p.is_file())
+        files += sorted(p for p in (root / "csrc").rglob("*") if p.name not in _LIVE_ONLY)
     digest = hashlib.sha256()
     for path in files:
         digest.update(f"{path.relative_to(root).as_posix()}\0".encode())

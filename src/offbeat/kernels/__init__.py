@@ -1,15 +1,25 @@
-"""The scan over rows: one signature, and the bodies that run it."""
+"""The scan over rows: one signature, and the two bodies that run it.
+
+The reference body (PyTorch) defines what a scan does and runs everywhere; the fused body (C++) does
+the same, faster, on the CPU. `OFFBEAT_SCAN` in the environment, or `use`, names the one to take:
+`auto`, `reference`, `fused`, or a compiled body such as `avx2`.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
 from torch import Tensor
 
-from offbeat.kernels import reference, written_out
-from offbeat.kernels.reference import perceptron
+from offbeat.errors import InputError, one_of
+from offbeat.kernels import fused, reference
 from offbeat.kernels.spec import (
     LARGEST_EXPONENT,
-    DecayRows,
     Layers,
+    RowTable,
     ScanRows,
     ScanSpec,
     ScanWeights,
@@ -17,30 +27,98 @@ from offbeat.kernels.spec import (
 
 __all__ = [
     "LARGEST_EXPONENT",
-    "DecayRows",
     "Layers",
+    "RowTable",
     "ScanRows",
     "ScanSpec",
     "ScanWeights",
+    "body",
     "perceptron",
     "scan",
+    "use",
 ]
+
+_chosen: ContextVar[str | None] = ContextVar("offbeat_scan", default=None)
+
+
+def body() -> tuple[str, str]:
+    """The body that scans run in here, and why.
+
+    Returns:
+        `reference`, or the name of a compiled body such as `avx2`; and the reason in words.
+
+    Raises:
+        InputError: a body is asked for that can't run here.
+    """
+    chosen, where = _chosen.get(), "offbeat.kernels.use"
+    if chosen is None:
+        chosen, where = os.environ.get("OFFBEAT_SCAN", "auto"), "OFFBEAT_SCAN"
+    compiled = fused.bodies()
+    one_of("scan body", chosen, ("auto", "reference", "fused", "baseline", "avx2", "avx512"))
+    if chosen == "reference":
+        return "reference", f"asked for by {where}"
+    if chosen == "auto":
+        if not compiled:
+            return "reference", f"the fused body was not built: {fused.why_not}"
+        return compiled[0], "the best that this processor runs"
+    if not compiled:
+        raise InputError(
+            f"{where} asks for the scan body {chosen!r}, but the fused body was not built "
+            f"({fused.why_not}); install Offbeat where a C++ compiler is"
+        )
+    if chosen == "fused":
+        return compiled[0], f"asked for by {where}"
+    if chosen not in compiled:
+        raise InputError(
+            f"{where} asks for the scan body {chosen!r}; this processor runs {', '.join(compiled)}"
+        )
+    return chosen, f"asked for by {where}"
+
+
+@contextmanager
+def use(name: str) -> Iterator[str]:
+    """Runs scans in the named body within a `with` block; yields what `body` then says.
+
+    Args:
+        name: `auto`, `reference`, `fused`, or a compiled body.
+    """
+    token = _chosen.set(name)
+    try:
+        yield body()[0]
+    finally:
+        _chosen.reset(token)
 
 
 def scan(
     spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Carries a batch of states over all rows, with the fastest body that can.
+    """Carries a batch of states over all rows, in the fused body where it can run the spec.
 
     Args:
         spec: the shape of the scan.
-        weights: what meets the state.
-        rows: what is read at each row.
+        weights: all that is trained in it.
+        rows: what is known of each row.
         state: (batch, state_size) before the first row.
 
     Returns:
-        Two tensors (rows, batch, state_size): the state carried to each row, before anything is
+        Two tensors (batch, rows, state_size): the state carried to each row, before anything is
         observed there, and the state after the row.
     """
-    body = written_out.scan if written_out.supports(spec, rows) else reference.scan
-    return body(spec, weights, rows, state)
+    name = body()[0]
+    if name == "reference" or fused.unsupported(spec, weights, rows, state):
+        return reference.scan(spec, weights, rows, state)
+    return fused.scan(spec, weights, rows, state, name)
+
+
+def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
+    """Applies linear layers with a nonlinearity between them, none after the last.
+
+    Args:
+        layers: weights and biases.
+        x: (..., inputs).
+        activation: `tanh` or `silu`.
+    """
+    name = body()[0]
+    if name == "reference" or not fused.supports_perceptron(layers, x):
+        return reference.perceptron(layers, x, activation)
+    return fused.perceptron(layers, x, activation, name)

@@ -6,7 +6,7 @@ decay -> flow over the gap -> (predictions are read here) -> cell at an observat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -28,20 +28,27 @@ def scan(
     """Carries a batch of states over all rows; every combination, as `offbeat.kernels.scan`."""
     before: list[Tensor] = []
     after: list[Tensor] = []
-    decays = _decays(spec, rows)
-    gates, updates, gaps = rows.gates.unbind(), rows.update.unbind(), rows.gap.unbind()
-    for i, (gap, gate, update, decay) in enumerate(zip(gaps, gates, updates, decays, strict=True)):
+    decays = _decays(spec, weights, rows)
+    gates = _gates(spec, weights, rows)
+    gaps, updates = rows.gap[..., None].unbind(1), rows.update[..., None].unbind(1)
+    shortest = rows.rows if rows.length is None else int(rows.length.min())
+    for i, (gap, update, decay) in enumerate(zip(gaps, updates, decays, strict=True)):
+        old = state
+        gate = gates[:, i] if gates is not None else None
         if rows.fed and rows.fed[i]:
             gate = _fed_gate(spec, weights, rows, state, i)
         state = _carry(spec, weights, gap, decay, state)
+        alive = None
+        if i >= shortest and rows.length is not None:
+            alive = (rows.length > i)[:, None]
+            state = torch.where(alive, state, old)
         before.append(state)
-        if spec.cell != "none":
-            observed = None
-            if rows.values is not None and rows.mask is not None:
-                observed = (rows.values[i], rows.mask[i])
-            state = _update(spec, weights, gate, update, observed, state)
+        if spec.cell != "none" and gate is not None:
+            observed = (rows.values[:, i], rows.mask[:, i]) if spec.anchored else None
+            updated = _update(spec, weights, gate, update, observed, state)
+            state = updated if alive is None else torch.where(alive, updated, state)
         after.append(state)
-    return torch.stack(before), torch.stack(after)
+    return torch.stack(before, dim=1), torch.stack(after, dim=1)
 
 
 def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
@@ -54,38 +61,94 @@ def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
     return x
 
 
-Decay = Tensor | tuple[Tensor, Tensor, Tensor] | None
-"""Of one row: the factor of h, or (start, end, applied) where it acts step by step, or nothing."""
+# --- what does not depend on the state: for all rows at once --------------------------------------
 
 
-def decay_factors(spec: ScanSpec, rows: ScanRows) -> Tensor | None:
-    """(rows, batch, hidden) what h is multiplied by at each row, for a decay that acts at once."""
-    if rows.decay is None:
+def _gates(spec: ScanSpec, weights: ScanWeights, rows: ScanRows) -> Tensor | None:
+    """(batch, rows, gates) input projection of the cell."""
+    if spec.cell == "none":
         return None
-    if not spec.has_field:
-        return torch.exp(rows.decay.applied - _exponent(rows.decay.end))
-    return torch.exp(-_growth(rows.decay.end, rows.decay.applied))
+    shown = rows.values
+    if spec.input_decay:
+        shown = _faded(weights, rows)
+    return linear(_input(rows, shown, slice(None)), _given(weights.inputs), weights.bias)
 
 
-def _decays(spec: ScanSpec, rows: ScanRows) -> Sequence[Decay]:
+def _input(rows: ScanRows, shown: Tensor, at: slice | int) -> Tensor:
+    parts = [shown, rows.mask[:, at]]
+    if rows.age is not None:
+        parts.append(rows.age[:, at])
+    return torch.cat(parts, dim=-1)
+
+
+def _faded(weights: ScanWeights, rows: ScanRows) -> Tensor:
+    """x-hat of equation 27: the observed value, or what is left of the last one."""
+    if weights.input_decay is None:
+        raise ValueError("input_decay needs ScanWeights.input_decay")
+    weight, bias = weights.input_decay
+    mean = _given(rows.mean)
+    gamma = torch.exp(-(weight * _given(rows.delta) + bias).clamp_min(0))
+    return torch.where(rows.mask > 0, rows.values, gamma * _given(rows.last) + (1 - gamma) * mean)
+
+
+@dataclass(frozen=True, eq=False)
+class DecayAlongGap:
+    """Exponents of the decay of h: over a gap, h is multiplied by exp(-(A(1) - applied)).
+
+    A(s) = max(0, (1 - s) start + s end) for s from 0 to 1 over the gap (equation 26 along time).
+
+    Attributes:
+        start: (batch, hidden) before the maximum, at the start of the gap.
+        end: (batch, hidden) before the maximum, at its end.
+        applied: (batch, hidden) what of A the state already carries.
+    """
+
+    start: Tensor
+    end: Tensor
+    applied: Tensor
+
+
+Decay = Tensor | DecayAlongGap | None
+"""Of one row: the factor of h, or the exponents where they act step by step, or nothing."""
+
+
+def _decays(spec: ScanSpec, weights: ScanWeights, rows: ScanRows) -> Sequence[Decay]:
     """The decay of each row; where it acts at once, the factors of all rows in one go."""
-    if rows.decay is None:
-        return [None] * len(rows.gap)
+    if not spec.decay:
+        return [None] * rows.rows
+    if weights.decay is None:
+        raise ValueError("a decay needs ScanWeights.decay")
+    end = linear(_given(rows.decay_end), *weights.decay)
+    if spec.decay_rows == "continuous":
+        start = linear(_given(rows.decay_start), *weights.decay)
+        fresh = _given(rows.updated)[..., None] > 0
+        applied = torch.where(fresh, 0.0, start.clamp(0, LARGEST_EXPONENT))
+    else:
+        # The whole exponent again: at each row it compounds over hidden ones.
+        if spec.decay_rows == "observed_rows":
+            end = end * rows.update[..., None]
+        start, applied = end, torch.zeros_like(end)
     several_steps = spec.steps_per_gap > 1 or spec.max_step is not None
-    if spec.has_field and (several_steps or tableau(spec.solver).adaptive):
-        parts = (rows.decay.start, rows.decay.end, rows.decay.applied)
-        return list(zip(*(part.unbind() for part in parts), strict=True))
-    return cast(Tensor, decay_factors(spec, rows)).unbind()
+    if spec.field and (several_steps or tableau(spec.solver).adaptive):
+        each = zip(start.unbind(1), end.unbind(1), applied.unbind(1), strict=True)
+        return [DecayAlongGap(*exponents) for exponents in each]
+    if not spec.field:
+        return torch.exp(applied - _exponent(end)).unbind(1)
+    return torch.exp(-_growth(end, applied)).unbind(1)
+
+
+def _given(tensor: Tensor | None) -> Tensor:
+    if tensor is None:
+        raise ValueError("the scan's rows or weights lack what its spec asks for")
+    return tensor
 
 
 def _fed_gate(
     spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor, i: int
 ) -> Tensor:
-    if weights.feed is None or rows.fed_gates is None:
-        raise ValueError("self-feeding needs ScanWeights.feed and ScanRows.fed_gates")
-    hidden = state[:, spec.anchored : spec.anchored + spec.hidden_size]
+    hidden = state[:, spec.anchors : spec.anchors + spec.hidden_size]
     decoded = perceptron(weights.decoder, hidden, "tanh")
-    return rows.fed_gates[i] + linear(decoded, weights.feed)
+    return linear(_input(rows, decoded, i), _given(weights.inputs), weights.bias)
 
 
 # --- over the gap ---------------------------------------------------------------------------------
@@ -98,9 +161,9 @@ def _carry(
     if isinstance(decay, Tensor):
         state = _scale_hidden(spec, state, decay)
         decay = None
-    if not spec.has_field:
+    if not spec.field:
         return state
-    driven = spec.anchored + spec.hidden_size
+    driven = spec.anchors + spec.hidden_size
     memory = state[:, driven:]
     state = state[:, :driven]
     state = _flow(spec, weights, gap, decay, state)
@@ -111,7 +174,7 @@ def _flow(
     spec: ScanSpec,
     weights: ScanWeights,
     gap: Tensor,
-    decay: tuple[Tensor, Tensor, Tensor] | None,
+    decay: DecayAlongGap | None,
     state: Tensor,
 ) -> Tensor:
     def field(_: Tensor, y: Tensor) -> Tensor:
@@ -143,7 +206,7 @@ def _flow_split(
     field: Field,
     parameters: Sequence[Tensor] | None,
     gap: Tensor,
-    decay: tuple[Tensor, Tensor, Tensor],
+    decay: DecayAlongGap,
     state: Tensor,
     steps: int | Tensor,
 ) -> Tensor:
@@ -151,10 +214,10 @@ def _flow_split(
 
     With one step per gap and every row observed this is algorithm 3 of the thesis.
     """
-    start, end, applied = decay
+    start, end, applied = decay.start, decay.end, decay.applied
     most = steps if isinstance(steps, int) else int(steps.max())
     for k in range(1, most + 1):
-        share = k / steps if isinstance(steps, int) else (k / steps).clamp_max(1.0).to(gap.dtype)
+        share = k / steps if isinstance(steps, int) else (k / steps.to(gap)).clamp_max(1.0)
         reached = start + share * (end - start)
         state = _scale_hidden(spec, state, torch.exp(-_growth(reached, applied)))
         applied = torch.maximum(applied, _exponent(reached))
@@ -170,11 +233,11 @@ def _flow_damped(
     field: Field,
     parameters: Sequence[Tensor] | None,
     gap: Tensor,
-    decay: tuple[Tensor, Tensor, Tensor],
+    decay: DecayAlongGap,
     state: Tensor,
 ) -> Tensor:
     """The limit of ever shorter split steps, adaptive: h = exp(-E(s)) u, solved for u."""
-    start, end, applied = decay
+    start, end, applied = decay.start, decay.end, decay.applied
     state = _scale_hidden(spec, state, torch.exp(-_growth(start, applied)))
 
     def exponent(s: Tensor) -> Tensor:
@@ -201,7 +264,7 @@ def _flow_damped(
 
 
 def _exponent(a: Tensor) -> Tensor:
-    """A of `DecayRows`, bounded."""
+    """A of `DecayAlongGap`, bounded."""
     return a.clamp(0, LARGEST_EXPONENT)
 
 
@@ -217,7 +280,7 @@ def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
     """Multiplies h, and leaves x and c."""
     if factor.shape == state.shape:
         return state * factor
-    first, last = spec.anchored, spec.anchored + spec.hidden_size
+    first, last = spec.anchors, spec.anchors + spec.hidden_size
     parts = [state[:, :first], state[:, first:last] * factor, state[:, last:]]
     return torch.cat(parts, dim=1)
 
@@ -235,7 +298,7 @@ def _update(
 ) -> Tensor:
     if observed is None:
         return _cell(spec, weights, gate, update, state)
-    x, rest = state[:, : spec.anchored], state[:, spec.anchored :]
+    x, rest = state[:, : spec.anchors], state[:, spec.anchors :]
     value, mask = observed
     if weights.innovation is not None:
         gate = torch.addmm(gate, mask * (value - x), weights.innovation.t())
@@ -264,7 +327,7 @@ def _cell(
     # equations 20-23, and 29-32 with the gates of GRU-D
     z, r = torch.sigmoid(torch.addmm(gate[:, : 2 * n], h, recurrent[: 2 * n].t())).chunk(2, dim=1)
     if spec.reset_after:
-        product = torch.addmm(weights.recurrent_bias, h, recurrent[2 * n :].t())  # type: ignore[arg-type]
+        product = torch.addmm(_given(weights.recurrent_bias), h, recurrent[2 * n :].t())
         candidate = torch.tanh(gate[:, 2 * n :] + r * product)
     else:
         candidate = torch.tanh(torch.addmm(gate[:, 2 * n :], r * h, recurrent[2 * n :].t()))

@@ -1,8 +1,9 @@
-"""What a scan consists of: its shape, its weights, and one record of row inputs.
+"""What a scan consists of: its shape, its weights, and one record of what is known of each row.
 
-A scan carries a state over rows. Whatever does not depend on the state is computed beforehand for
-the whole sequence (input projections, decay exponents, gaps) and stands in `ScanRows`; what does
-depend on it (innovation, self-feeding, vector field, recurrent product) is named here.
+A scan carries a state over rows. The facts of a row (`ScanRows`) follow from times, masks and
+values alone; no weight has touched them, so they are made once for a data set. Everything that a
+weight touches happens inside the scan: what does not depend on the state (input projection, decay
+exponents, x-hat), and what does (innovation, self-feeding, vector field, recurrent product).
 
 The state of one trajectory is `[x | h | c]`: `anchored` channels, `hidden_size` hidden units, and
 as many memory units when the cell is an LSTM.
@@ -10,9 +11,11 @@ as many memory units when the cell is an LSTM.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 LARGEST_EXPONENT = 30.0
@@ -24,11 +27,14 @@ class ScanSpec:
     """The shape of a scan.
 
     Attributes:
+        channels: width of the observed values.
         hidden_size: units of h.
-        anchored: channels held inside the state; 0 for none.
-        cell: `gru`, `elman`, `lstm`, `set` (h becomes the gates, a start value) or `none`.
+        anchored: the channels are held inside the state, and an observation sets them.
+        cell: `gru`, `elman`, `lstm`, `set` (h becomes the input's projection, a start value) or
+            `none`.
         reset_after: the GRU's reset gate acts after the recurrent product.
-        has_field: a vector field drives (x, h) over each gap.
+        ages: width of what tells the cell how old its knowledge is; 0 for nothing.
+        field: units of each layer of the vector field, ends included; empty without one.
         activation: nonlinearity between the layers of the vector field.
         solver: name of a tableau.
         steps_per_gap: least number of equal steps of a fixed-step solver over one gap.
@@ -36,13 +42,22 @@ class ScanSpec:
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver.
         adjoint: gradients of the flow by the adjoint method.
+        decay: width of what the decay of h is made from: 0 without one, else the ages of all
+            channels (equation 26) or one elapsed time (equation 42).
+        decay_rows: meaning of a row in which nothing is observed: `continuous`, the exponent grows
+            along time; `every_row`, it acts again at each row; `observed_rows`, only where the
+            cell acts.
+        input_decay: last values fade to the mean (equation 27).
+        decoder: units of each layer of the decoder, ends included, with self-feeding only.
     """
 
+    channels: int
     hidden_size: int
-    anchored: int = 0
+    anchored: bool = False
     cell: Literal["none", "set", "elman", "lstm", "gru"] = "gru"
     reset_after: bool = False
-    has_field: bool = False
+    ages: int = 0
+    field: tuple[int, ...] = ()
     activation: Literal["tanh", "silu"] = "tanh"
     solver: str = "euler"
     steps_per_gap: int = 1
@@ -50,6 +65,10 @@ class ScanSpec:
     rtol: float = 1e-4
     atol: float = 1e-6
     adjoint: bool = False
+    decay: int = 0
+    decay_rows: Literal["continuous", "every_row", "observed_rows"] = "continuous"
+    input_decay: bool = False
+    decoder: tuple[int, ...] = ()
 
     @property
     def gates(self) -> int:
@@ -58,10 +77,15 @@ class ScanSpec:
         return factor * self.hidden_size
 
     @property
+    def anchors(self) -> int:
+        """Channels held inside the state."""
+        return self.channels if self.anchored else 0
+
+    @property
     def state_size(self) -> int:
         """Units of the whole state."""
         memory = self.hidden_size if self.cell == "lstm" else 0
-        return self.anchored + self.hidden_size + memory
+        return self.anchors + self.hidden_size + memory
 
 
 Layers = tuple[tuple[Tensor, Tensor], ...]
@@ -70,64 +94,155 @@ Layers = tuple[tuple[Tensor, Tensor], ...]
 
 @dataclass(frozen=True, eq=False)
 class ScanWeights:
-    """The weights that meet the state inside the scan.
+    """The weights of a scan.
 
     Gate order: GRU update, reset, candidate; LSTM forget, input, node, output.
 
     Attributes:
-        recurrent: (gates, hidden) or None without a recurrent cell.
-        recurrent_bias: (hidden,) bias inside the reset product, with `reset_after` only.
-        innovation: (gates, anchored), with an anchored state only.
+        inputs: (gates, 2 channels + ages) of values, mask and ages; None without a cell.
+        bias: (gates,).
+        recurrent: (gates, hidden); None without a recurrent cell.
+        recurrent_bias: (hidden,) inside the reset product, with `reset_after` only.
+        innovation: (gates, channels), with an anchored state only.
+        decay: weight (hidden, decay) and bias (hidden,) of the exponents, or None.
+        input_decay: weight (channels,) and bias (channels,) of gamma_x, or None.
         field: layers of the vector field; empty without one.
-        feed: (gates, channels) projects fed-back predictions, with self-feeding only.
         decoder: layers of the decoder, with self-feeding only.
     """
 
+    inputs: Tensor | None = None
+    bias: Tensor | None = None
     recurrent: Tensor | None = None
     recurrent_bias: Tensor | None = None
     innovation: Tensor | None = None
+    decay: tuple[Tensor, Tensor] | None = None
+    input_decay: tuple[Tensor, Tensor] | None = None
     field: Layers = ()
-    feed: Tensor | None = None
     decoder: Layers = ()
 
+    def tensors(self) -> Iterator[Tensor]:
+        """All weights that there are, in the order of the packed buffer."""
+        for tensor in (
+            self.inputs,
+            self.bias,
+            self.recurrent,
+            self.recurrent_bias,
+            self.innovation,
+        ):
+            if tensor is not None:
+                yield tensor
+        for pair in (self.decay, self.input_decay):
+            if pair is not None:
+                yield from pair
+        for layers in (self.field, self.decoder):
+            for layer in layers:
+                yield from layer
 
-@dataclass(frozen=True, eq=False)
-class DecayRows:
-    """Exponents of the decay of h: over row i's gap, h is multiplied by exp(-(A(1) - applied)).
-
-    A(s) = max(0, (1 - s) start + s end) for s from 0 to 1 over the gap (equation 26 along time).
-
-    Attributes:
-        start: (rows, batch, hidden) before the maximum, at the start of the gap.
-        end: (rows, batch, hidden) before the maximum, at its end.
-        applied: (rows, batch, hidden) what of A the state already carries.
-    """
-
-    start: Tensor
-    end: Tensor
-    applied: Tensor
+    def packed(self) -> Tensor:
+        """All weights in one flat buffer; gradients flow through."""
+        return torch.cat([tensor.reshape(-1) for tensor in self.tensors()])
 
 
 @dataclass(frozen=True, eq=False)
 class ScanRows:
-    """What the scan reads at each row; time runs along the first axis.
+    """What is known of each row; no weight has touched it.
 
     Attributes:
-        gap: (rows, batch, 1) model time since the row before, saturated.
-        update: (rows, batch, 1) 1.0 where the cell acts, else 0.0.
-        gates: (rows, batch, gates) input projection, biases included.
-        decay: exponents of the decay of h, or None.
-        values: (rows, batch, anchored) observed values, 0 elsewhere; anchored only.
-        mask: (rows, batch, anchored) 1.0 where observed; anchored only.
-        fed_gates: (rows, batch, gates) `gates` without the values' part; self-feeding only.
-        fed: one bool per row, True where the cell's input is the decoded state; self-feeding only.
+        gap: (batch, rows) model time since the row before, saturated.
+        update: (batch, rows) 1.0 where the cell acts, else 0.0.
+        values: (batch, rows, channels) observed values, 0 elsewhere.
+        mask: (batch, rows, channels) 1.0 where observed, else 0.0.
+        age: (batch, rows, ages) how old the cell's knowledge is, or None.
+        updated: (batch, rows) 1.0 where the cell acted at the row before; with a decay only.
+        decay_start: (batch, rows, decay) what the decay is made from, at the start of the gap.
+        decay_end: (batch, rows, decay) the same at its end.
+        delta: (batch, rows, channels) model time since each channel's last observation; with
+            `input_decay` only.
+        last: (batch, rows, channels) last value of each channel; with `input_decay` only.
+        mean: (channels,) what a value fades to; with `input_decay` only.
+        length: (batch,) int64, rows of each trajectory; later rows are padding and leave the state
+            as it is. None: all rows count.
+        fed: one bool per row, True where the decoded state stands for the observed values; with
+            self-feeding only.
     """
 
     gap: Tensor
     update: Tensor
-    gates: Tensor
-    decay: DecayRows | None = None
-    values: Tensor | None = None
-    mask: Tensor | None = None
-    fed_gates: Tensor | None = None
+    values: Tensor
+    mask: Tensor
+    age: Tensor | None = None
+    updated: Tensor | None = None
+    decay_start: Tensor | None = None
+    decay_end: Tensor | None = None
+    delta: Tensor | None = None
+    last: Tensor | None = None
+    mean: Tensor | None = None
+    length: Tensor | None = None
     fed: tuple[bool, ...] = ()
+
+    def __len__(self) -> int:
+        return self.gap.shape[0]
+
+    @property
+    def rows(self) -> int:
+        """Rows of the longest trajectory."""
+        return self.gap.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class RowTable:
+    """The facts of many trajectories side by side in one tensor, so that a batch is one gather.
+
+    Attributes:
+        table: (trajectories, rows, columns).
+        places: of each fact: its name, its columns, and whether it has an axis of units.
+        mean: as `ScanRows.mean`.
+        length: as `ScanRows.length`.
+    """
+
+    table: Tensor
+    places: tuple[tuple[str, slice, bool], ...]
+    mean: Tensor | None
+    length: Tensor | None
+
+    @classmethod
+    def of(cls, rows: ScanRows) -> RowTable:
+        """Puts facts side by side.
+
+        Args:
+            rows: of all trajectories.
+        """
+        facts = {f.name: getattr(rows, f.name) for f in fields(rows)}
+        for name in ("mean", "length", "fed"):
+            facts.pop(name)
+        places, columns, known, width = [], [], {}, 0
+        for name, value in facts.items():
+            if value is None:
+                continue
+            if id(value) not in known:  # one tensor may stand for two facts
+                column = value if value.ndim == 3 else value[..., None]
+                known[id(value)] = slice(width, width + column.shape[2])
+                columns.append(column)
+                width += column.shape[2]
+            places.append((name, known[id(value)], value.ndim == 3))
+        return cls(torch.cat(columns, dim=2), tuple(places), rows.mean, rows.length)
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def take(self, index: Tensor) -> ScanRows:
+        """Some trajectories, trimmed to the longest of them.
+
+        Args:
+            index: (batch,) positions.
+        """
+        length = None if self.length is None else self.length.index_select(0, index)
+        table = self.table
+        if length is not None:
+            table = table[:, : int(length.max())]
+        table = table.index_select(0, index)
+        facts: dict[str, Any] = {
+            name: table[..., at] if units else table[..., at.start]
+            for name, at, units in self.places
+        }
+        return ScanRows(**facts, mean=self.mean, length=length)

@@ -96,7 +96,7 @@ def load_training_state(
 
 
 def _weights(model: RecurrentModel) -> dict[str, Tensor]:
-    return {k: v.detach().contiguous().cpu() for k, v in model.state_dict().items()}
+    return {k: v.detach().cpu().clone() for k, v in model.state_dict().items()}
 
 
 def _facts(model: RecurrentModel) -> dict[str, Any]:

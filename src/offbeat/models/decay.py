@@ -1,13 +1,13 @@
-"""Decay parts: how h fades with time, and how a last value fades to the mean."""
+"""Decay parts: how h fades with time, and how a last value fades to the mean.
+
+They hold the weights; the exponents are made inside the scan, from the ages of a row.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear, softplus
-
-from offbeat.kernels import LARGEST_EXPONENT, DecayRows
-from offbeat.models.ages import Ages
+from torch.nn.functional import softplus
 
 
 class TrainableDecay(nn.Module):
@@ -23,11 +23,9 @@ class TrainableDecay(nn.Module):
         self.weight = nn.Parameter(torch.empty(hidden_size, channels))
         self.bias = nn.Parameter(torch.zeros(hidden_size))
 
-    def exponents(self, ages: Ages, unit: float) -> tuple[Tensor, Tensor]:
-        """(batch, rows, hidden) exponents at the start and the end of each row's gap."""
-        dtype = self.weight.dtype
-        start, end = ((d / unit).to(dtype) for d in (ages.delta_before, ages.delta))
-        return linear(start, self.weight, self.bias), linear(end, self.weight, self.bias)
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Weight (hidden, channels) and bias (hidden,) of the exponent."""
+        return self.weight, self.bias
 
 
 class ExponentialDecay(nn.Module):
@@ -43,13 +41,10 @@ class ExponentialDecay(nn.Module):
         self.hidden_size = hidden_size
         self.raw_tau = nn.Parameter(torch.empty(1 if scalar else hidden_size))
 
-    def exponents(self, ages: Ages, unit: float) -> tuple[Tensor, Tensor]:
-        """(batch, rows, hidden) exponents at the start and the end of each row's gap."""
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Weight (hidden, 1) and bias (hidden,), which is 0, of the exponent."""
         tau = softplus(self.raw_tau).expand(self.hidden_size)
-        start, end = (
-            (e / unit).to(tau.dtype)[..., None] * tau for e in (ages.elapsed_before, ages.elapsed)
-        )
-        return start, end
+        return tau[:, None], tau.new_zeros(self.hidden_size)
 
 
 class InputDecay(nn.Module):
@@ -64,39 +59,6 @@ class InputDecay(nn.Module):
         self.weight = nn.Parameter(torch.empty(channels))
         self.bias = nn.Parameter(torch.zeros(channels))
 
-    def forward(
-        self, values: Tensor, mask: Tensor, ages: Ages, mean: Tensor, unit: float
-    ) -> Tensor:
-        """(batch, rows, channels) the observed value, or what is left of the last one."""
-        delta = (ages.delta / unit).to(values.dtype)
-        gamma = torch.exp(-(self.weight * delta + self.bias).clamp_min(0))
-        return torch.where(mask, values, gamma * ages.last + (1 - gamma) * mean)
-
-
-Decay = TrainableDecay | ExponentialDecay
-
-
-def decay_rows(
-    decay: Decay, ages: Ages, unit: float, *, rows: str, update: Tensor, updated: Tensor
-) -> DecayRows:
-    """Exponents as the scan takes them, for one of the three meanings of a hidden row.
-
-    Args:
-        decay: the part that knows the exponents.
-        ages: at each row.
-        unit: s per unit of model time.
-        rows: `continuous`, `every_row` or `observed_rows`, as in `ModelConfig.decay_rows`.
-        update: (batch, rows) bool, True where the cell acts.
-        updated: (batch, rows) bool, True where it acted at the row before.
-    """
-    start, end = decay.exponents(ages, unit)
-    if rows == "every_row" and isinstance(decay, TrainableDecay):
-        # The whole exponent of the cumulative age again at each row: it compounds.
-        start, applied = end, torch.zeros_like(end)
-    elif rows == "observed_rows":
-        end = torch.where(update[..., None], end, 0.0)
-        start, applied = end, torch.zeros_like(end)
-    else:
-        applied = torch.where(updated[..., None], 0.0, start.clamp(0, LARGEST_EXPONENT))
-    time_first = (t.transpose(0, 1).contiguous() for t in (start, end, applied))
-    return DecayRows(*time_first)
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """Weight (channels,) and bias (channels,) of the exponent of gamma_x."""
+        return self.weight, self.bias

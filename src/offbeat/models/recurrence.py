@@ -9,20 +9,18 @@ a stream is the same call with one row and the `Carry` of the rows before.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from offbeat.config import ModelConfig
 from offbeat.data.batch import Batch
 from offbeat.data.prepare import Scaler
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.kernels import ScanRows, ScanSpec, ScanWeights, scan
+from offbeat.kernels import ScanRows, ScanSpec, ScanWeights, body, fused, scan
 from offbeat.models.ages import Ages, Carry, ages
-from offbeat.models.decay import ExponentialDecay, InputDecay, TrainableDecay, decay_rows
+from offbeat.models.decay import ExponentialDecay, InputDecay, TrainableDecay
 from offbeat.models.parts import Cell, Perceptron, initialise
 from offbeat.models.statistics import Statistics
 
@@ -82,38 +80,20 @@ class RecurrentModel(nn.Module):
         self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
         self.register_buffer("std", torch.tensor(statistics.std), persistent=False)
 
-        has_field = config.vector_field == "mlp"
-        anchored = channels if config.anchored else 0
-        starts_only = config.cell == "none"
-        self.spec = ScanSpec(
-            hidden_size=hidden,
-            anchored=anchored,
-            cell="set" if starts_only else config.cell,  # type: ignore[arg-type]
-            reset_after=bool(config.reset_after) and config.cell == "gru",
-            has_field=has_field,
-            activation=config.activation or "tanh",
-            solver=config.solver or "euler",
-            steps_per_gap=config.steps_per_gap or 1,
-            max_step=config.max_step,
-            rtol=config.rtol or 1e-4,
-            atol=config.atol or 1e-6,
-            adjoint=config.gradient == "adjoint",
-        )
         self.decay = _decay(config, channels, hidden)
         self.input_decay = InputDecay(channels) if config.input_decay else None
-        age = {"none": 0, "elapsed": 1, "gap": 1, "delta": channels}[config.age_input or "none"]
+        self.spec = _spec(config, channels, self.decay)
+        anchored = self.spec.anchors
         self.cell = Cell(
             self.spec.gates,
-            2 * channels + age,
-            hidden_size=0 if starts_only else hidden,
+            2 * channels + self.spec.ages,
+            hidden_size=0 if config.cell == "none" else hidden,
             innovation=anchored,
             reset_after=self.spec.reset_after,
         )
         self.field = None
-        if has_field:
-            driven = anchored + hidden
-            sizes = (driven, *(config.field_units or ()), driven)
-            self.field = Perceptron(sizes, self.spec.activation)
+        if self.spec.field:
+            self.field = Perceptron(self.spec.field, self.spec.activation)
         self.decoder = None
         self.start = None
         if anchored:
@@ -163,12 +143,29 @@ class RecurrentModel(nn.Module):
             batch: number of trajectories.
             coins: generator of the coins of self-feeding; by default one seeded with 0.
         """
-        state = self.cell.bias.new_zeros(self.spec.state_size - self.spec.anchored)
-        if self.start is not None:
-            state = torch.cat([self.start, state])
         if coins is None and self.config.self_feeding:
             coins = torch.Generator().manual_seed(0)
-        return Carry.empty(state.expand(batch, -1), self.mean, coins=coins)
+        return Carry.empty(self.first_state(batch), self.mean, coins=coins)
+
+    def runs_fused(self) -> bool:
+        """Whether the scan of this model runs in compiled code here."""
+        if body()[0] == "reference":
+            return False
+        nothing = torch.zeros(1, 1, dtype=self.dtype)
+        cells = torch.zeros(1, 1, self.channels, dtype=self.dtype)
+        rows = ScanRows(gap=nothing, update=nothing, values=cells, mask=cells)
+        return not fused.unsupported(self.spec, self.scan_weights(), rows, self.first_state(1))
+
+    def first_state(self, batch: int) -> Tensor:
+        """(batch, state_size) before anything is observed.
+
+        Args:
+            batch: number of trajectories.
+        """
+        state = self.cell.bias.new_zeros(self.spec.state_size - self.spec.anchors)
+        if self.start is not None:
+            state = torch.cat([self.start, state])
+        return state.expand(batch, -1)
 
     def forward(
         self, batch: Batch, *, carry: Carry | None = None, coins: torch.Generator | None = None
@@ -183,27 +180,45 @@ class RecurrentModel(nn.Module):
         Raises:
             InputError: the batch has other channels than the model.
         """
-        if batch.channels != self.channels:
-            raise InputError(
-                f"the batch has {batch.channels} channels, the model has {self.channels}"
-            )
         if carry is None:
             carry = self.empty_carry(len(batch), coins=coins)
-        at_rows, carried = ages(
-            batch,
-            carry,
-            elapsed_limit=self.statistics.longest_elapsed * float(self.config.gap_limit or 1),
-            from_first_row=self.config.clock == "first_row",
-        )
-        rows = self._rows(batch, at_rows, carry)
-        before, after = scan(self.spec, self._weights(), rows, carry.state)
+        rows, carried = self.facts(batch, carry)
+        predictions, before, after = self.run(rows, carry.state, coins=carry.coins, seen=carry.rows)
+        carried = replace(carried, state=after[:, -1], updated=rows.update[:, -1] > 0)
+        return Output(predictions, before, after, carried)
+
+    def run(
+        self,
+        rows: ScanRows,
+        state: Tensor | None = None,
+        *,
+        coins: torch.Generator | None = None,
+        seen: int = 0,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Predicts rows whose facts are known: all of `forward` that a weight touches.
+
+        Args:
+            rows: from `facts`.
+            state: (batch, state_size) before them; by default as nothing has been seen.
+            coins: generator of the coins of self-feeding.
+            seen: number of rows before them.
+
+        Returns:
+            Predictions (batch, rows, channels), states before and after each row
+            (batch, rows, state_size).
+        """
+        if state is None:
+            state = self.first_state(len(rows))
+        if self.config.self_feeding:
+            rows = replace(
+                rows, fed=_coins(coins, seen, rows.rows, float(self.config.self_feeding))
+            )
+        before, after = scan(self.spec, self.scan_weights(), rows, state)
         read = before
         if self.config.readout == "last_row":
-            read = torch.cat([carry.state[None], after[:-1]])
-        carried = replace(carried, state=after[-1], updated=rows.update[-1, :, 0] > 0)
-        return Output(
-            self.read(read).transpose(0, 1), before.transpose(0, 1), after.transpose(0, 1), carried
-        )
+            shifted = torch.cat([state, after.flatten(1)[:, : -self.spec.state_size]], dim=1)
+            read = shifted.view_as(after)
+        return self.read(read), before, after
 
     def read(self, state: Tensor) -> Tensor:
         """(..., state_size) states to (..., channels) predictions in scaled units."""
@@ -212,85 +227,128 @@ class RecurrentModel(nn.Module):
         decoded: Tensor = self.decoder(state[..., : self.hidden_size])
         return decoded
 
-    def _weights(self) -> ScanWeights:
-        feeding = bool(self.config.self_feeding)
+    def scan_weights(self) -> ScanWeights:
+        """All that is trained within the scan."""
         return ScanWeights(
+            inputs=self.cell.inputs,
+            bias=self.cell.bias,
             recurrent=self.cell.recurrent,
             recurrent_bias=self.cell.recurrent_bias,
             innovation=self.cell.innovation,
+            decay=self.decay.weights() if self.decay is not None else None,
+            input_decay=self.input_decay.weights() if self.input_decay is not None else None,
             field=self.field.layers if self.field is not None else (),
-            feed=self.cell.inputs[:, : self.channels] if feeding else None,
-            decoder=self.decoder.layers if feeding and self.decoder is not None else (),
+            decoder=self.decoder.layers if self.spec.decoder and self.decoder is not None else (),
         )
 
-    def _rows(self, batch: Batch, at_rows: Ages, carry: Carry) -> ScanRows:
-        """Everything of a row that does not depend on the state, for all rows at once."""
-        config, dtype, unit = self.config, self.dtype, self.time_unit
+    def facts(self, batch: Batch, carry: Carry | None = None) -> tuple[ScanRows, Carry]:
+        """What is known of each row; no weight has touched it, so it holds for all of a training.
+
+        Args:
+            batch: scaled; rows to come, in order.
+            carry: what was seen before; by default nothing.
+
+        Returns:
+            The facts, and the carry of the last row but for its state.
+
+        Raises:
+            InputError: the batch has other channels than the model.
+        """
+        if batch.channels != self.channels:
+            raise InputError(
+                f"the batch has {batch.channels} channels, the model has {self.channels}"
+            )
+        config, dtype, unit, spec = self.config, self.dtype, self.time_unit, self.spec
+        if carry is None:
+            carry = self.empty_carry(len(batch))
+        at_rows, carried = ages(
+            batch,
+            carry,
+            elapsed_limit=self.statistics.longest_elapsed * float(config.gap_limit or 1),
+            from_first_row=config.clock == "first_row",
+        )
         mask = batch.mask & batch.valid[..., None]
         values = torch.where(mask, batch.values, 0.0)
-        if self.input_decay is not None:
-            shown = self.input_decay(values, mask, at_rows, self.mean, unit)
-        elif self.spec.anchored:
+        if spec.anchored:
             values = torch.where(mask, (batch.values - self.mean) / self.std, 0.0)
-            shown = values
-        else:
-            shown = values
-        context = [mask.to(dtype)]
-        if config.age_input == "delta":
-            longest = self.statistics.longest_delta * float(config.gap_limit or 1)
-            age = at_rows.delta.clamp_max(longest)
-            context.append((age / self.statistics.median_gap).to(dtype))
-        elif config.age_input in ("elapsed", "gap"):
-            age = at_rows.elapsed if config.age_input == "elapsed" else at_rows.step
-            context.append((age / self.statistics.median_gap).to(dtype)[..., None])
         update = at_rows.observed
         if config.cell == "none":
             update = at_rows.first
         elif config.update_rows == "every":
             update = batch.valid
-        updated = torch.cat([carry.updated[:, None], update[:, :-1]], dim=1)
-        gates = linear(torch.cat([shown, *context], dim=2), self.cell.inputs, self.cell.bias)
         rows = ScanRows(
-            gap=(at_rows.gap / unit).to(dtype)[..., None],
-            update=update.to(dtype)[..., None],
-            gates=gates,
-            values=values if self.spec.anchored else None,
-            mask=mask.to(dtype) if self.spec.anchored else None,
+            gap=(at_rows.gap / unit).to(dtype),
+            update=update.to(dtype),
+            values=values,
+            mask=mask.to(dtype),
+            age=self._age(at_rows),
+            length=batch.valid.sum(dim=1),
         )
-        if config.self_feeding:
-            weight = self.cell.inputs[:, self.channels :]
-            fed = linear(torch.cat(context, dim=2), weight, self.cell.bias)
-            rows = replace(rows, fed_gates=fed)
-        rows = _time_first(rows)
-        if config.self_feeding:
-            rows = replace(rows, fed=_coins(carry, batch.rows, float(config.self_feeding)))
-        if self.decay is not None:
-            decay = decay_rows(
-                self.decay,
-                at_rows,
-                unit,
-                rows=config.decay_rows or "",
-                update=update,
-                updated=updated,
+        delta = (at_rows.delta / unit).to(dtype) if spec.decay or spec.input_decay else None
+        if spec.input_decay:
+            rows = replace(rows, delta=delta, last=at_rows.last, mean=self.mean)
+        if spec.decay:
+            updated = torch.cat([carry.updated[:, None], update[:, :-1]], dim=1)
+            start, end = at_rows.delta_before, at_rows.delta
+            if not isinstance(self.decay, TrainableDecay):
+                start, end = at_rows.elapsed_before[..., None], at_rows.elapsed[..., None]
+                delta = (end / unit).to(dtype)
+            rows = replace(
+                rows,
+                updated=updated.to(dtype),
+                decay_start=(start / unit).to(dtype),
+                decay_end=delta,
             )
-            rows = replace(rows, decay=decay)
-        return rows
+        return rows, carried
+
+    def _age(self, at_rows: Ages) -> Tensor | None:
+        """(batch, rows, ages) what tells a plain cell how old its knowledge is."""
+        name, median = self.config.age_input, self.statistics.median_gap
+        if name == "delta":
+            longest = self.statistics.longest_delta * float(self.config.gap_limit or 1)
+            return (at_rows.delta.clamp_max(longest) / median).to(self.dtype)
+        if name in ("elapsed", "gap"):
+            age = at_rows.elapsed if name == "elapsed" else at_rows.step
+            return (age / median).to(self.dtype)[..., None]
+        return None
 
 
-def _time_first(rows: ScanRows) -> ScanRows:
-    moved: dict[str, Any] = {f.name: getattr(rows, f.name) for f in fields(rows)}
-    for name, value in moved.items():
-        if isinstance(value, Tensor):
-            moved[name] = value.transpose(0, 1).contiguous()
-    return ScanRows(**moved)
+def _spec(
+    config: ModelConfig, channels: int, decay: TrainableDecay | ExponentialDecay | None
+) -> ScanSpec:
+    hidden = int(config.hidden_size or 1)
+    driven = hidden + (channels if config.anchored else 0)
+    decay_rows = config.decay_rows or "continuous"
+    if decay_rows == "every_row" and not isinstance(decay, TrainableDecay):
+        decay_rows = "continuous"  # of elapsed time the two are the same
+    return ScanSpec(
+        channels=channels,
+        hidden_size=hidden,
+        anchored=bool(config.anchored),
+        cell="set" if config.cell == "none" else config.cell or "gru",
+        reset_after=bool(config.reset_after) and config.cell == "gru",
+        ages={"none": 0, "elapsed": 1, "gap": 1, "delta": channels}[config.age_input or "none"],
+        field=(driven, *(config.field_units or ()), driven) if config.vector_field == "mlp" else (),
+        activation=config.activation or "tanh",
+        solver=config.solver or "euler",
+        steps_per_gap=config.steps_per_gap or 1,
+        max_step=config.max_step,
+        rtol=config.rtol or 1e-4,
+        atol=config.atol or 1e-6,
+        adjoint=config.gradient == "adjoint",
+        decay=0 if decay is None else channels if isinstance(decay, TrainableDecay) else 1,
+        decay_rows=decay_rows,
+        input_decay=bool(config.input_decay),
+        decoder=(hidden, *(config.decoder_units or ()), channels) if config.self_feeding else (),
+    )
 
 
-def _coins(carry: Carry, rows: int, share: float) -> tuple[bool, ...]:
+def _coins(coins: torch.Generator | None, seen: int, rows: int, share: float) -> tuple[bool, ...]:
     """One coin per row, drawn row by row so that a stream draws the same; never at row 0."""
-    if carry.coins is None:
+    if coins is None:
         raise InputError("self-feeding draws coins: the carry needs a generator (empty_carry)")
-    drawn = [float(torch.rand((), generator=carry.coins)) < share for _ in range(rows)]
-    return tuple(fed and carry.rows + i > 0 for i, fed in enumerate(drawn))
+    drawn = torch.rand(rows, generator=coins).tolist()  # the same draws as one by one
+    return tuple(coin < share and seen + i > 0 for i, coin in enumerate(drawn))
 
 
 def _decay(

@@ -41,13 +41,15 @@ def ranks_figure(results: FriedmanResult | Mapping[str, FriedmanResult]) -> Figu
             "a diagram of ranks needs at least one result of Friedman's test, got none"
         )
     heights = [_height(result) + _TITLE * bool(title) for title, result in panels.items()]
+    halves = [_halves(result) for result in panels.values()]
+    ends = (max(_room(h[0]) for h in halves), _WIDTH - max(_room(h[1]) for h in halves))
     with rc_context(RC):
         figure = Figure(figsize=(_WIDTH, sum(heights)))
         top = sum(heights)
         for (title, result), height in zip(panels.items(), heights, strict=True):
             top -= height
             axes = figure.add_axes((0.0, top / sum(heights), 1.0, height / sum(heights)))
-            _panel(axes, title, result, height)
+            _panel(axes, title, result, height, ends)
     return figure
 
 
@@ -56,16 +58,16 @@ def _height(result: FriedmanResult) -> float:
     return _ABOVE + _BAR * len(result.groups) + _LINE * (rows + 0.5) + _BELOW
 
 
-def _panel(axes: Axes, title: str, result: FriedmanResult, height: float) -> None:
+def _panel(
+    axes: Axes, title: str, result: FriedmanResult, height: float, ends: tuple[float, float]
+) -> None:
     """Draws in inches: the origin is the lower left corner of the panel."""
     axes.set_xlim(0, _WIDTH)
     axes.set_ylim(0, height)
     axes.axis("off")
     models, ranks = len(result.names), result.ranks
-    names, half = list(ranks), (models + 1) // 2
-    labels = {name: style_of(name).label for name in names}
-    left = _room([labels[name] for name in names[:half]])
-    right = _WIDTH - _room([labels[name] for name in names[half:]])
+    names, half = list(ranks), len(_halves(result)[0])
+    left, right = ends
     line = height - _ABOVE - _TITLE * bool(title)
 
     def x(rank: float) -> float:
@@ -92,8 +94,8 @@ def _panel(axes: Axes, title: str, result: FriedmanResult, height: float) -> Non
     axes.text((left + right) / 2, 0.06, what, ha="center", va="bottom", color=_GREY, fontsize=8)
     for i, group in enumerate(result.groups):
         y = line - _BAR * (i + 1)
-        ends = [x(ranks[group[0]]) - 0.04, x(ranks[group[-1]]) + 0.04]
-        axes.plot(ends, (y, y), color=_GREY, linewidth=3.2, solid_capstyle="butt", label="_group")
+        span = [x(ranks[group[0]]) - 0.04, x(ranks[group[-1]]) + 0.04]
+        axes.plot(span, (y, y), color=_GREY, linewidth=3.2, solid_capstyle="butt", label="_group")
     first = line - _BAR * len(result.groups) - _LINE
     for place, name in enumerate(names):
         at_left = place < half
@@ -113,7 +115,7 @@ def _panel(axes: Axes, title: str, result: FriedmanResult, height: float) -> Non
             label=name,
             zorder=4,
         )
-        parts = [labels[name], f"{ranks[name]:.2f}"]
+        parts = [style.label, f"{ranks[name]:.2f}"]
         axes.text(
             end + (-0.05 if at_left else 0.05),
             y,
@@ -122,6 +124,13 @@ def _panel(axes: Axes, title: str, result: FriedmanResult, height: float) -> Non
             va="center",
             color=_INK,
         )
+
+
+def _halves(result: FriedmanResult) -> tuple[list[str], list[str]]:
+    """Labels that stand at the left and at the right, each from the best to the worst."""
+    labels = [style_of(name).label for name in result.ranks]
+    half = (len(labels) + 1) // 2
+    return labels[:half], labels[half:]
 
 
 def _room(labels: list[str]) -> float:

@@ -33,6 +33,11 @@ STYLES: dict[str, Style] = {
     # The palette of Okabe and Ito (2008), then, for models met more rarely, that of Tol (2021).
     "truth": Style("Truth", "#000000", ""),
     "last_value": Style("Last value", "#7F7F7F", "", (0, (4, 2))),
+    "linear": Style("Linear", "#DDAA33", "", _DASHED),
+    "pchip": Style("PCHIP", "#004488", "", _DASH_DOT),
+    "constant_velocity": Style("Constant velocity", "#BB5566", "", _DOTTED),
+    "causal": Style("Model, causal", "#33BBEE", "", _DASHED),
+    "two_sided": Style("Model, two-sided", "#CC3311", ""),
     "gru": Style("GRU", "#56B4E9", "o", _DOTTED),
     "gru_d": Style("GRU-D", "#E69F00", "s", _DASH_DOT),
     "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),

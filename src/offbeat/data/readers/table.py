@@ -1,29 +1,30 @@
-"""CSV, read as a data set: a header, then one row per time."""
+"""CSV, read as a data set: a header, then one row per time, or one per measured value."""
 
 from __future__ import annotations
 
 import csv
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from offbeat.data.clock import NANOSECONDS_PER, state_time_unit
+from offbeat.data.readers.batches import NullCellError, gather, line_error
+from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
+from offbeat.data.recording import Recording
+from offbeat.data.source import require_file
+from offbeat.errors import FileFormatError, InputError
 
-from offbeat.data.store import require_file
-from offbeat.data.trajectory import SECONDS_PER, Dataset, Trajectory
-from offbeat.errors import FileFormatError, InputError, one_of
-
-TIME_COLUMNS = ("time", "t", "timestamp", "time_s", "time_ms", "time_us", "time_ns")
-"""Names that make a column the time, in any case; the first of them that the file has. The last
-four say their unit, too."""
-
-TRAJECTORY_COLUMNS = ("trajectory", "episode")
-"""Names, in any case, that make a column the label of the trajectory that a row belongs to."""
-
-MISSING = ("", "NaN", "nan", "NA", "null")
+MISSING = ("", "NaN", "nan", "NA", "N/A", "<NA>", "null", "NULL", "None")
 """What a cell holds where its value is not known."""
+
+DELIMITERS = (",", ";", "\t")
+"""Tried in this order on the header, where none is given."""
+
+_BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
+_SAMPLE = 1000  # lines that say what a column holds
+_BLOCK = 1 << 20  # bytes of text in memory at a time
 
 
 def read_csv(
@@ -34,128 +35,69 @@ def read_csv(
     channels: Sequence[str] | None = None,
     time_unit: str | None = None,
     units: Mapping[str, str] | None = None,
-    delimiter: str = ",",
-) -> Dataset:
-    """Reads a data set from CSV: a header, then one row per time.
+    delimiter: str | None = None,
+    channel_column: str | None = None,
+    value_column: str | None = None,
+) -> list[Recording]:
+    """Reads recordings from CSV: a header, then one row per time, or one per measured value.
 
-    The rows of a trajectory stand in the order of time; trajectories may take turns. An integer
-    clock loses no bits: its times count from the first row of each trajectory, and
-    `meta["clock_start"]` keeps what that row said.
+    A first column without a name that counts the rows, as pandas writes it, is left out. A unit in
+    brackets after a name, as in `speed [m/s]`, is the channel's unit and no part of its name.
+    Times keep every digit down to the nanosecond. The file is read a mebibyte at a time.
 
     Args:
         path: the file, in UTF-8.
-        time_column: the column of times; by default found by its name, see `TIME_COLUMNS`.
+        time_column: the column of times; by default found by its name, see `TIME_NAMES`.
         trajectory_column: the column that says to which trajectory a row belongs, by a number or
-            any text; by default found by its name, see `TRAJECTORY_COLUMNS`. Without one, the file
-            is one trajectory.
-        channels: the columns to read as channels; by default all others.
-        time_unit: `s`, `ms`, `us` or `ns`; by default what the column's name says, else `s`.
-        units: unit of a channel by its name; CSV itself has none.
-        delimiter: the character between two cells.
+            any text; by default found by its name, see `LABEL_NAMES`. Without one, the file is one
+            trajectory.
+        channels: the columns to read as channels (in the long form: their names in the column of
+            channels), in the order wanted; by default all.
+        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's name says, else
+            found by the numbers, which is said aloud, else `s`.
+        units: unit of a channel by its name.
+        delimiter: the character between two cells; by default a comma, or the semicolon or tab
+            that the header has instead.
+        channel_column: the column that says which channel a value is of, in the long form; by
+            default found where the table has a `channel` and a `value` and nothing else.
+        value_column: the column of values, in the long form.
 
     Returns:
-        Trajectories in the order of their first rows; a cell that is empty, or another of
-        `MISSING`, is NaN.
+        A recording per trajectory, in the order of their first rows; a cell that is empty, or
+        another of `MISSING`, is NaN.
 
     Raises:
-        FileFormatError: the file is missing or empty, its header or a row is not as it must be, a
-            cell is not a number, or times do not increase.
+        FileFormatError: the file is missing or empty, its header or a row is not as it must be, or
+            a cell is not a number.
         InputError: an option names a column or a unit that there is not.
     """
-    if len(delimiter) != 1 or not delimiter.isascii() or delimiter in '"\r\n':
+    if delimiter is not None and (
+        len(delimiter) != 1 or not delimiter.isascii() or delimiter in '"\r\n'
+    ):
         raise InputError(
             f"delimiter must be one ASCII character, no quote or line end, got {delimiter!r}"
         )
-    file = _CsvFile(require_file(path), delimiter)
+    file = _CsvFile(require_file(path), delimiter or ",")
+    if delimiter is None:
+        file = file.with_delimiter_of_header()
     header = file.header()
-    time = _column("time_column", time_column, TIME_COLUMNS, header)
-    if time is None:
-        raise FileFormatError(
-            f"{file.path} has no column of times: its first line must name one of "
-            f"{', '.join(TIME_COLUMNS)}, got {_listed(header)}; say which one with time_column="
-        )
-    others = [name for name in header if name != time]
-    label = _column("trajectory_column", trajectory_column, TRAJECTORY_COLUMNS, others)
-    names = [name for name in others if name != label]
-    if not names:
-        raise FileFormatError(
-            f"{file.path} has no channels, only the columns {_listed(header)}; "
-            "it needs one column per channel beside the time"
-        )
-    if channels is not None:
-        names = [one_of("channel", name, names) for name in dict.fromkeys(channels)]
-    units = dict(units or {})
-    for name in units:
-        one_of("channel in units", name, names)
-    unit_said = time.casefold().removeprefix("time_")
-    unit = time_unit or (unit_said if unit_said in SECONDS_PER else "s")
-    one_of("time unit", unit, SECONDS_PER)
-    if unit_said in SECONDS_PER and unit != unit_said:
-        raise InputError(
-            f"{file.path}: the column {time!r} says that times are in {unit_said}, time_unit says "
-            f"{unit}; leave time_unit out, or rename the column"
-        )
-
-    clock, labels, values = file.columns(header, time, label, names)
-    groups = _groups(labels, file, label)
-    trajectories = []
-    for text, rows in groups.items():
-        origin = f"{file.path.name}, {label} {text}" if label else file.path.name
-        _check_increasing(clock, rows, file, origin)
-        try:
-            trajectory = Trajectory.from_arrays(
-                clock[rows],
-                values[rows],
-                time_unit=unit,
-                names=tuple(names),
-                units=tuple(units.get(name, "") for name in names),
-                origin=origin,
-            )
-        except InputError as error:
-            raise FileFormatError(f"{file.path}: {error}") from None
-        trajectories.append(trajectory)
-    meta: dict[str, Any] = {"source": file.path.name, "time_unit": unit}
-    if label:
-        meta["labels"] = list(groups)
-    if clock.dtype.kind == "i":
-        meta["clock_start"] = [int(clock[rows[0]]) for rows in groups.values()]
-    return Dataset(tuple(trajectories), meta)
-
-
-def _column(option: str, given: str | None, usual: Sequence[str], header: list[str]) -> str | None:
-    if given is not None:
-        return one_of(option, given, header)
-    folded = {name.casefold(): name for name in reversed(header)}
-    return next((folded[name] for name in usual if name in folded), None)
-
-
-def _groups(labels: Any, file: _CsvFile, label: str | None) -> dict[str, NDArray[np.int64]]:
-    """Positions of the rows of every trajectory, in order, by label in order of appearance."""
-    coded = labels.combine_chunks().dictionary_encode()
-    codes, texts = coded.indices.to_numpy(), coded.dictionary.to_pylist()
-    if label and "" in texts:
-        line = file.line_of(int(np.argmax(codes == texts.index(""))))
-        raise FileFormatError(
-            f"{file.path} has an empty cell in line {line}, column {label!r}; "
-            "every row must say which trajectory it belongs to"
-        )
-    order = np.argsort(codes, kind="stable")
-    starts = np.flatnonzero(np.diff(codes[order]))
-    return dict(zip(texts, np.split(order, starts + 1), strict=True))
-
-
-def _check_increasing(
-    clock: NDArray[Any], rows: NDArray[np.int64], file: _CsvFile, origin: str
-) -> None:
-    late = np.flatnonzero(np.diff(clock[rows]) <= 0)
-    if late.size:
-        row = int(late[0]) + 1
-        before, after = rows[row - 1], rows[row]
-        raise FileFormatError(
-            f"{file.path}: times (of {origin}) must increase strictly, got {clock[before]} at row "
-            f"{row - 1} (line {file.line_of(before)}) and {clock[after]} at row {row} (line "
-            f"{file.line_of(after)}); sort the rows and drop repeated times"
-        )
+    sample = file.sample(header)
+    columns = Columns.of(
+        file.path,
+        [name for name in header if name],
+        time_column=time_column,
+        trajectory_column=trajectory_column,
+        channels=channels,
+        units=units,
+        channel_column=channel_column,
+        value_column=value_column,
+    )
+    numbers = [float(cell) for cell in sample[columns.time] if _is_number(cell)]
+    unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
+    if not header[0]:
+        notes = (*notes, "the first column has no name and counts the rows; it is left out")
+    table, counted_in = file.columns(header, sample, columns, unit)
+    return recordings(file.path, columns, counted_in, notes, table, shown=unit)
 
 
 @dataclass(frozen=True)
@@ -165,8 +107,17 @@ class _CsvFile:
     path: Path
     delimiter: str
 
+    def with_delimiter_of_header(self) -> _CsvFile:
+        """The same file, with the delimiter that its header has."""
+        _, cells = next(self._lines(), (0, [""]))
+        if len(cells) == 1:
+            for delimiter in DELIMITERS[1:]:
+                if delimiter in cells[0]:
+                    return _CsvFile(self.path, delimiter)
+        return self
+
     def header(self) -> list[str]:
-        """The column names, stripped; unique, none of them empty."""
+        """The column names, stripped; unique; the first may be empty, where it counts the rows."""
         line, cells = next(self._lines(), (0, []))
         names = [cell.strip() for cell in cells]
         if line != 1:
@@ -174,63 +125,111 @@ class _CsvFile:
             raise FileFormatError(
                 f"{self.path} must name its columns in line 1, got {got}; mend its first line"
             )
+        names[0] = names[0].removeprefix("#").strip()
+        if names[0] == "Unnamed: 0":
+            names[0] = ""
         for i, name in enumerate(names):
-            if not name or name in names[:i]:
+            if name in names[:i] or not (name or (i == 0 and self._counts_rows())):
                 fault = f"the column name {name!r} twice" if name else f"no name for column {i}"
                 raise FileFormatError(
-                    f"{self.path} has {fault} in its first line, got {_listed(names)}; "
+                    f"{self.path} has {fault} in its first line, got {listed(names)}; "
                     "give every column a name of its own"
                 )
         return names
 
+    def _counts_rows(self) -> bool:
+        cells = [line[0] for _, line in itertools.islice(self._lines(), 1, _SAMPLE)]
+        first = int(cells[0]) if cells and cells[0].isdecimal() else 0
+        return cells == [str(first + i) for i in range(len(cells))]
+
+    def sample(self, header: list[str]) -> dict[str, list[str]]:
+        """The cells of the first lines, by column."""
+        lines = [cells for _, cells in itertools.islice(self._lines(), 1, _SAMPLE)]
+        whole = [cells for cells in lines if len(cells) == len(header)]
+        return {name: [cells[i].strip() for cells in whole] for i, name in enumerate(header)}
+
     def columns(
-        self, header: list[str], time: str, label: str | None, names: list[str]
-    ) -> tuple[NDArray[Any], Any, NDArray[np.float64]]:
-        """The clock, (rows,) int64 or float64; the labels, as Arrow strings; the values."""
+        self, header: list[str], sample: dict[str, list[str]], columns: Columns, unit: str
+    ) -> tuple[Gathered, str]:
+        """The columns that are needed, and the unit that the clock is in now."""
         import pyarrow as pa
+
+        types = {name: _type_of(sample[name]) for name in columns.channels}
+        types |= {name: pa.string() for name in (columns.label, columns.key) if name}
+        places = len(str(NANOSECONDS_PER[unit])) - 1
+        clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
+        if not all(cell.lstrip("+-").isdecimal() for cell in sample[columns.time]):
+            clocks = clocks[1:]
+        capacity = self._count_lines()
+        for clock in clocks:
+            try:
+                table = gather(
+                    self._batches(header, columns, types | {columns.time: clock}),
+                    columns,
+                    capacity,
+                )
+            except (pa.ArrowException, OverflowError) as error:
+                at = f"In CSV column #{header.index(columns.time)}:"
+                if clock is clocks[-1] or (at not in str(error) and clock is not clocks[0]):
+                    self._explain(header, columns)
+                    raise line_error(self.path, error) from None
+                continue
+            except NullCellError as error:
+                raise self._empty(error, columns) from None
+            if not len(table.clock):
+                raise FileFormatError(
+                    f"{self.path} has a header and no rows, expected one per time"
+                )
+            return table, "ns" if pa.types.is_decimal(clock) else unit
+        raise AssertionError("the last clock raises or returns")
+
+    def _batches(self, header: list[str], columns: Columns, types: dict[str, Any]) -> Iterator[Any]:
         import pyarrow.csv as pv
 
-        types = dict.fromkeys(names, pa.float64()) | ({label: pa.string()} if label else {})
-        try:
-            table = pv.read_csv(
-                self.path,
-                read_options=pv.ReadOptions(column_names=header, skip_rows=1),
-                parse_options=pv.ParseOptions(delimiter=self.delimiter, newlines_in_values=True),
-                convert_options=pv.ConvertOptions(
-                    column_types=types, include_columns=[time, *types], null_values=MISSING
-                ),
-            )
-        except pa.ArrowException as error:
-            self._explain(header, [time, *names])
-            raise FileFormatError(f"{self.path}: {' '.join(str(error).split())}") from None
-        clock = table.column(time)
-        if not len(clock):
-            raise FileFormatError(f"{self.path} has a header and no rows, expected one per time")
-        if clock.null_count:
-            line = self.line_of(int(np.argmax(clock.is_null().to_numpy())))
-            raise FileFormatError(
-                f"{self.path} has no time in line {line}, column {time!r}; drop that row"
-            )
-        if not (pa.types.is_integer(clock.type) or pa.types.is_floating(clock.type)):
-            self._explain(header, [time])
-            raise FileFormatError(f"{self.path} has {clock.type} in column {time!r}, not numbers")
-        values = np.empty((len(clock), len(names)))
-        for c, name in enumerate(names):
-            values[:, c] = table.column(name).to_numpy()
-        labels = table.column(label) if label else pa.chunked_array([pa.repeat("", len(clock))])
-        return clock.to_numpy(), labels, values
+        names = [name or "" for name in header]
+        with pv.open_csv(
+            self.path,
+            read_options=pv.ReadOptions(column_names=names, skip_rows=1, block_size=_BLOCK),
+            parse_options=pv.ParseOptions(delimiter=self.delimiter, newlines_in_values=True),
+            convert_options=pv.ConvertOptions(
+                column_types=types, include_columns=columns.read, null_values=MISSING
+            ),
+        ) as reader:
+            yield from reader
+
+    def _count_lines(self) -> int:
+        """At least the number of rows."""
+        ends = returns = 0
+        with self.path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                ends += block.count(b"\n")
+                returns += block.count(b"\r") if not ends else 0
+        return max(ends, returns) + 1
 
     def line_of(self, row: int) -> int:
         """The line in which a row of data ends, counted from 1; the header is line 1."""
         return next(line for i, (line, _) in enumerate(self._lines()) if i == row + 1)
 
-    def _explain(self, header: list[str], numeric: list[str]) -> None:
+    def _empty(self, error: NullCellError, columns: Columns) -> FileFormatError:
+        line = self.line_of(error.row)
+        if error.column == columns.time:
+            return FileFormatError(
+                f"{self.path} has no time in line {line}, column {error.column!r}; drop that row"
+            )
+        what = "trajectory" if error.column == columns.label else "channel"
+        return FileFormatError(
+            f"{self.path} has an empty cell in line {line}, column {error.column!r}; every row "
+            f"must say which {what} it belongs to"
+        )
+
+    def _explain(self, header: list[str], columns: Columns) -> None:
         """Raises an error that names the line and column at fault, if one can be found."""
+        numeric = [columns.time, *columns.channels]
         for line, cells in self._lines():
             if len(cells) != len(header):
                 raise FileFormatError(
                     f"{self.path} has {len(cells)} cells in line {line}, expected {len(header)}, "
-                    f"one per column: {_listed(header)}"
+                    f"one per column: {listed(header)}"
                 )
             for name, cell in zip(header, cells, strict=True):
                 if line > 1 and name in numeric and cell not in MISSING and not _is_number(cell):
@@ -253,13 +252,17 @@ class _CsvFile:
             ) from None
 
 
+def _type_of(cells: list[str]) -> Any:
+    """The Arrow type of a channel by its first cells: booleans by name, else numbers."""
+    import pyarrow as pa
+
+    known = [cell for cell in cells if cell not in MISSING]
+    return pa.bool_() if known and all(c in _BOOLEANS for c in known) else pa.float64()
+
+
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
         return False
     return "_" not in cell  # which Python allows between digits, and nobody else
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(map(repr, names))

@@ -18,7 +18,7 @@ from offbeat.experiment.engines.base import Ending, Engine, attempt
 from offbeat.experiment.execute import Task
 from offbeat.experiment.side_by_side import end_with_parent
 
-_GIB_PER_PROCESS = 1.5  # data of the full protocol, its parts, torch
+_GIB_PER_PROCESS = 2.0  # data of the full protocol, its parts, torch: 1.7 at the peak
 
 
 class LocalEngine(Engine):
@@ -57,24 +57,22 @@ class LocalEngine(Engine):
 
     def wait(self, seconds: float) -> list[Ending]:
         """Waits until a process is done with its task or has died."""
-        busy = [worker for worker in self._workers if worker.task is not None]
+        busy = [(worker, worker.task) for worker in self._workers if worker.task is not None]
         if not busy:
             return []
-        connection.wait(
-            [*(w.pipe for w in busy), *(w.process.sentinel for w in busy)], timeout=seconds
-        )
+        signs = [sign for worker, _ in busy for sign in (worker.pipe, worker.process.sentinel)]
+        connection.wait(signs, timeout=seconds)
         endings = []
-        for worker in busy:
-            assert worker.task is not None
+        for worker, task in busy:
             try:
                 if worker.pipe.poll():
-                    endings.append(Ending(worker.task, worker.pipe.recv()))
+                    endings.append(Ending(task, worker.pipe.recv()))
                     worker.task = None
                     continue
             except (EOFError, OSError):
                 worker.process.join()
             if worker.process.exitcode is not None:
-                endings.append(Ending(worker.task, lost=True))
+                endings.append(Ending(task, lost=True))
                 self._workers.remove(worker)
                 worker.pipe.close()
         return endings
@@ -88,10 +86,6 @@ class LocalEngine(Engine):
         for worker in self._workers:
             worker.process.join()
         self._workers.clear()
-
-    def pids(self) -> list[int]:
-        """Process ids of those that work on a task."""
-        return [worker.process.pid for worker in self._workers if worker.task is not None]
 
 
 @dataclass(eq=False)

@@ -22,6 +22,8 @@ from offbeat.report.statistics.ranks import friedman
 from offbeat.report.statistics.samples import Sample, check_level, equal
 from offbeat.report.statistics.two_samples import ThesisTest, shapiro_wilk, thesis_test
 
+_FEW = 20  # pairs; from so few, BCa intervals hold the truth visibly less often than they say
+
 Error = Literal["rmse", "mse"]
 
 
@@ -202,6 +204,11 @@ def _remarks(
     if n < FEWEST_RESAMPLED:
         notes.append(
             f"With {n} pairs there are no bootstrap intervals; {FEWEST_RESAMPLED} are needed"
+        )
+    elif n < _FEW:
+        notes.append(
+            f"BCa intervals of {n} pairs are somewhat too short (docs/statistics.md); Student's "
+            "interval of the mean difference is in the JSON"
         )
     if len(scores.draws[result.condition]) == 1:
         notes.append(

@@ -1,0 +1,118 @@
+"""One training step (forward, backward, optimizer): ours, and the same architecture by others.
+
+All contestants take turns within one process, with the same threads, weights and batch, and must
+agree on the loss before they are timed.
+
+    python benchmarks/training_step.py --threads 2 --json results/benchmarks/training_step.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from common import machine, synthetic, write
+from peers import JaxContestant, TorchContestant, facts_of
+
+import offbeat as ob
+from offbeat import kernels
+from offbeat.run_state import RunState, flat_parameters
+from offbeat.training import Examples, threads_for, train_step
+
+MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
+
+
+def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Callable[[], float]:
+    """A training step of this library in one of its bodies."""
+    model = ob.make(config, data, seed=0)
+    examples = Examples(model, model.batch(data))
+    training = ob.TrainConfig()
+    state = RunState(flat_parameters(model).__enter__(), training)
+    index = torch.arange(len(examples))
+
+    def step() -> float:
+        with kernels.use(body), threads_for(model):
+            return train_step(model, examples, index, state, training, total=1)
+
+    return step
+
+
+def contestants(name: str, data: ob.Dataset) -> dict[str, Callable[[], float]]:
+    """Everyone who can run a model here."""
+    config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
+    model = ob.make(config, data, seed=0)
+    batch = model.batch(data)
+    rows, _ = model.facts(batch)
+    facts = facts_of(rows, batch.values)
+    found: dict[str, Callable[[], float]] = {}
+    if kernels.fused.bodies():
+        found["ours, fused"] = ours(config, data, "fused")
+    found["ours, reference"] = ours(config, data, "reference")
+    found["eager torchdiffeq" if model.spec.field else "eager torch"] = TorchContestant(
+        model, facts
+    )
+    if importlib.util.find_spec("jax"):
+        found["JAX, jitted scan"] = JaxContestant(model, facts)
+    return found
+
+
+def measure(name: str, data: ob.Dataset, repeats: int) -> dict[str, Any]:
+    """Times of all contestants in turn, ms."""
+    steps = contestants(name, data)
+    first = {who: step() for who, step in steps.items()}
+    expected = first["ours, reference"]
+    for who, loss in first.items():
+        if abs(loss - expected) > 1e-4 * abs(expected):
+            raise SystemExit(f"{name}: {who} computes the loss {loss}, the reference {expected}")
+    for step in steps.values():
+        step()
+    times: dict[str, list[float]] = {who: [] for who in steps}
+    for _ in range(repeats):
+        for who, step in steps.items():
+            time.sleep(0.02)  # the idle threads of the contestant before go to sleep
+            start = time.perf_counter()
+            step()
+            times[who].append(1e3 * (time.perf_counter() - start))
+    own = times.get("ours, fused", times["ours, reference"])
+    result = {}
+    for who, each in times.items():
+        ratio = statistics.median(t / o for t, o in zip(each, own, strict=True))
+        result[who] = {
+            "median_ms": round(statistics.median(each), 2),
+            "fastest_ms": round(min(each), 2),
+            "median_ratio_to_fused": round(ratio, 2),
+        }
+    return result
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--batch", type=int, default=50)
+    parser.add_argument("--rows", type=int, default=100)
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--models", nargs="*", default=list(MODELS))
+    parser.add_argument("--json")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    data = synthetic(options.batch, options.rows, observed_fraction=0.3)
+    found = {}
+    for name in options.models:
+        found[name] = measure(name, data, options.repeats)
+        for who, numbers in found[name].items():
+            print(
+                f"{name:20} {who:18} {numbers['median_ms']:8.1f} ms   "
+                f"x{numbers['median_ratio_to_fused']:.2f}",
+                flush=True,
+            )
+    write(options.json, {"machine": machine(), "options": vars(options), "steps": found})
+
+
+if __name__ == "__main__":
+    main()

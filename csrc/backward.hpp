@@ -1,0 +1,514 @@
+// The backward pass of a block: part of Scan<T> (body.hpp).
+//
+// Rows go by in groups, last first. The tape of a group is what the forward pass kept, or is computed
+// again. What reaches each matrix in a group is added to its gradient in one go, so that the
+// gradient's own traffic through the cache is paid once per group.
+
+// Products that wait to be added: to_out (out, lane) times x (in, lane), summed over lanes.
+static constexpr int MAX_PAIRS = 64, PAIRS_AT_ONCE = 8;
+struct Pairs {
+  int count[M_END] = {};
+  const T* to_out[M_END][MAX_PAIRS];
+  const T* x[M_END][MAX_PAIRS];
+};
+
+template <int R, int NV>
+static INLINE void outer_tile(int pairs, int W, const T* const* to_out, int o, const T* xt,
+                              int64_t in, int i, T* sum) {
+  V acc[R][NV];
+  for (int r = 0; r < R; ++r)
+    for (int v = 0; v < NV; ++v) acc[r][v] = load<T>(sum + (o + r) * in + i + v * VW);
+  for (int e = 0; e < pairs; ++e) {
+    const T* g = to_out[e] + int64_t(o) * W;
+    for (int lane = 0; lane < W; ++lane) {
+      V xv[NV];
+      for (int v = 0; v < NV; ++v) xv[v] = load<T>(xt + i + v * VW);
+      xt += in;
+      for (int r = 0; r < R; ++r) {
+        const V gv = splat(g[r * W + lane]);
+        for (int v = 0; v < NV; ++v) acc[r][v] = fma(gv, xv[v], acc[r][v]);
+      }
+    }
+  }
+  for (int r = 0; r < R; ++r)
+    for (int v = 0; v < NV; ++v) store<T>(sum + (o + r) * in + i + v * VW, acc[r][v]);
+}
+
+// All outputs against one strip of NV vectors of inputs; R * NV sums at a time hide their latency.
+template <int R, int NV>
+static NOINLINE void outer_strip(int pairs, int W, const T* const* to_out,
+                                                  int out, const T* xt, int in, int i, T* sum) {
+  int o = 0;
+  for (; o + R <= out; o += R) outer_tile<R, NV>(pairs, W, to_out, o, xt, in, i, sum);
+  for (; o < out; ++o) outer_tile<1, NV>(pairs, W, to_out, o, xt, in, i, sum);
+}
+
+// [unit][lane] to [lane][unit], units padded with zeros.
+static void turn(const T* x, int units, int padded, int W, T* xt) {
+  T* lanes[2 * VW];
+  for (int lane = 0; lane < W; ++lane) {
+    lanes[lane] = xt + int64_t(lane) * padded;
+    for (int u = units; u < padded; ++u) lanes[lane][u] = 0;
+  }
+  units_to_lanes(x, units, W, W, lanes);
+}
+
+static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, const T* const* to_out, const T* const* x,
+                      T* sums, T* xt) {
+  const int in = up(m.in, VW);
+  T* sum = sums + m.sum;
+  for (int first = 0; first < pairs; first += PAIRS_AT_ONCE) {
+    const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
+    for (int e = 0; e < n; ++e) turn(x[first + e], m.in, in, W, xt + int64_t(e) * W * in);
+    for (int i = 0; i < in;) {  // strips of three vectors, the rest in pairs where it can be
+      const int left = (in - i) / VW;
+      if (left == 3 || left > 4) {
+        outer_strip<4, 3>(n, W, to_out + first, m.out, xt, in, i, sum);
+        i += 3 * VW;
+      } else if (left >= 2) {
+        outer_strip<4, 2>(n, W, to_out + first, m.out, xt, in, i, sum);
+        i += 2 * VW;
+      } else {
+        outer_strip<8, 1>(n, W, to_out + first, m.out, xt, in, i, sum);
+        i += VW;
+      }
+    }
+  }
+  if (m.bias < 0) return;
+  for (int o = 0; o < m.out; ++o) {
+    T* to = sums + m.bias_sum + int64_t(o) * VW;
+    V acc = load<T>(to);
+    for (int e = 0; e < pairs; ++e)
+      for (int v = 0; v < W; v += VW) acc += load<T>(to_out[e] + int64_t(o) * W + v);
+    store<T>(to, acc);
+  }
+}
+
+static void flush(const Map& map, Pairs& pairs, int W, T* sums, T* xt) {
+  for (int i = 0; i < M_END; ++i) {
+    if (!pairs.count[i]) continue;
+    add_pairs(map.m[i], pairs.count[i], W, pairs.to_out[i], pairs.x[i], sums, xt);
+    pairs.count[i] = 0;
+  }
+}
+
+// Where the gradients of a row's affine maps lie until they are added; offsets in units.
+struct Slots {
+  int gate, held, start, end, decoder, field, field_size, size;
+};
+static Slots slots(const Spec& s, const Dims& d, int max_steps) {
+  Slots l{};
+  int at = 0;
+  auto take = [&](int n) {
+    const int here = at;
+    at += n;
+    return here;
+  };
+  l.gate = take(d.G);
+  l.held = take(d.H);
+  l.start = take(d.F ? d.H : 0);
+  l.end = take(d.F ? d.H : 0);
+  l.decoder = at;
+  for (int k = 0; k < s.decoder.layers; ++k) at += s.decoder.sizes[k + 1];
+  l.field = at;
+  for (int k = 0; k < s.field.layers; ++k) l.field_size += s.field.sizes[k + 1];
+  l.size = at + l.field_size * s.stages * max_steps;
+  return l;
+}
+
+template <class P>
+struct Back {
+  const Context<P>& c;
+  Slots slots;
+  Pairs& pairs;
+  T *sums, *xt;
+  T *z, *shown, *stage_gradients;  // scratch
+
+  void push(int id, const T* to_out, const T* x) {
+    if (pairs.count[id] == MAX_PAIRS) flush(c.map, pairs, P::W, sums, xt);
+    const int n = pairs.count[id]++;
+    pairs.to_out[id][n] = to_out;
+    pairs.x[id][n] = x;
+  }
+};
+
+// From the gradient of a perceptron's result, which already lies at the end of `kept_gradients`, to
+// the one of its argument.
+template <class P>
+static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int first, const Net& n,
+                              const T* x, const T* kept, T* kept_gradients, T* to_x) {
+  constexpr int W = P::W;
+  T* to_out = kept_gradients;
+  for (int l = 0; l + 1 < shape.layers; ++l) to_out += int64_t(shape.sizes[l + 1]) * W;
+  for (int l = shape.layers - 1; l >= 0; --l) {
+    const Matrix& m = k.c.map.m[first + l];
+    const T* value = l ? kept + int64_t(n.value[l - 1]) * W : x;
+    k.push(first + l, to_out, value);
+    if (l == 0) {
+      P::template transposed<false>(m, k.c.packed, to_out, to_x);
+      break;
+    }
+    P::template transposed<false>(m, k.c.packed, to_out, k.z);
+    to_out -= int64_t(shape.sizes[l]) * W;
+    activate_backward<P>(shape.activation, shape.sizes[l], value,
+                         kept + int64_t(n.slope[l - 1]) * W, k.z, to_out);
+  }
+}
+
+// `g` comes as the gradient of the state after the row and leaves as the one before the gap.
+template <class P>
+static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* g,
+                         const Job<T>& job, const Block& b, int row) {
+  const Context<P>& c = k.c;
+  const Spec& s = c.s;
+  const Dims& d = c.map.d;
+  const Layout<P>& l = c.l;
+  constexpr int W = P::W;
+  auto at = [&](int units) { return tape + int64_t(units) * W; };
+  auto to = [&](int units) { return slot + int64_t(units) * W; };
+  T* gh = g + int64_t(l.h_at) * W;
+  T* gate = to(k.slots.gate);
+  const bool shown_matters = f.active && (f.fed || s.input_decay);
+
+  if (f.active) {
+    cell_backward<P>(k, f, tape, slot, gh, g + int64_t(l.c_at) * W);
+    k.push(M_IN, gate, at(l.u));
+    if (d.A) {
+      k.push(M_INNOV, gate, at(l.innovation));
+      P::template transposed<false>(c.map.m[M_INNOV], c.packed, gate, k.z);
+      P::each(d.A, [&](int64_t i, int) {
+        const V m = load<T>(f.mask + i);
+        store<T>(g + i, (1 - m) * load<T>(g + i) - m * load<T>(k.z + i));
+      });
+    }
+    if (shown_matters) P::template transposed<false>(c.map.m[M_IN], c.packed, gate, k.shown);
+  }
+  collect<P>(job, b, job.to_before, row, d.S, true, g);
+
+  // Flow and decay, last step first.
+  T steps[W], span[W];
+  const int most = s.field.layers ? steps_of<P>(s, f.gap, steps) : 1;
+  const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
+  T* to_start = to(k.slots.start);
+  T* to_end = to(k.slots.end);
+  T* to_known = k.z + int64_t(widest<P>(s)) * W;
+  if (d.F) {
+    zero(to_start, int64_t(d.H) * W);
+    zero(to_end, int64_t(d.H) * W);
+    zero(to_known, int64_t(d.H) * W);
+  }
+  for (int q = most - 1; q >= 0; --q) {
+    const T* step = at(l.step) + int64_t(q) * l.step_size * W;
+    if (s.field.layers) {
+      for (int i = 0; i < W; ++i) span[i] = T(q) < steps[i] ? f.gap[i] / steps[i] : T(0);
+      T* kept = to(k.slots.field) + int64_t(q) * s.stages * k.slots.field_size * W;
+      runge_kutta_backward<P>(k, span, g, step + int64_t(l.stage) * W, kept);
+    }
+    if (!d.F) continue;
+    const T* applied = step + int64_t(l.applied) * W;
+    const T* factor = step + int64_t(l.factor) * W;
+    const T* arrived = step + int64_t(l.arrived) * W;
+    const T* previous = applied - int64_t(l.step_size) * W;
+    P::each(d.H, [&](int64_t i, int lane) {
+      const V first = load<T>(at(l.start) + i), last = load<T>(at(l.end) + i);
+      const V fresh = load<T>(f.updated + lane);
+      V known;
+      if (q)
+        known = load<T>(previous + i);
+      else if (s.decay_rows != CONTINUOUS)
+        known = splat(0);
+      else
+        known = fresh != T(0) ? splat(0) : clip(first);
+      V share = splat(1), reached = last;
+      if (!one_shot) {
+        share = T(q + 1) / load<T>(steps + lane);
+        share = share > T(1) ? splat(1) : share;
+        reached = fma(share, last - first, first);
+      }
+      const V bounded = clip(reached), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
+      store<T>(gh + i, gradient * gamma);
+      V to_grown = -gamma * gradient * load<T>(arrived + i);
+      if (s.field.layers) to_grown = bounded - known >= T(0) ? to_grown : splat(0);
+      // The larger of the two is what the state carries on; a tie shares the gradient.
+      const V carried = load<T>(to_known + i);
+      const V share_reached =
+          bounded > known ? splat(1) : bounded == known ? splat(T(0.5)) : splat(0);
+      const V to_bounded = to_grown + carried * share_reached;
+      const V to_previous = carried * (1 - share_reached) - to_grown;
+      const V to_reached = to_bounded * inside(reached);
+      V start = load<T>(to_start + i) + (1 - share) * to_reached;
+      store<T>(to_end + i, load<T>(to_end + i) + share * to_reached);
+      if (q == 0 && s.decay_rows == CONTINUOUS)
+        start = start + (fresh != T(0) ? splat(0) : to_previous * inside(first));
+      store<T>(to_start + i, start);
+      store<T>(to_known + i, to_previous);
+    });
+  }
+  if (d.F) {
+    P::each(d.H, [&](int64_t i, int lane) {
+      const V alive = load<T>(f.alive + lane);
+      V start = load<T>(to_start + i) * alive, end = load<T>(to_end + i) * alive;
+      if (s.decay_rows != CONTINUOUS) end = end + start, start = splat(0);
+      if (s.decay_rows == OBSERVED_ROWS) end = end * load<T>(f.update + lane);
+      store<T>(to_start + i, start);
+      store<T>(to_end + i, end);
+    });
+    k.push(M_DECAY, to_end, f.end);
+    if (s.decay_rows == CONTINUOUS) k.push(M_DECAY, to_start, f.start);
+  }
+
+  if (!shown_matters) return;
+  if (f.fed) {
+    T* kept = to(k.slots.decoder);
+    T* to_out = kept;
+    for (int q = 0; q + 1 < s.decoder.layers; ++q) to_out += int64_t(s.decoder.sizes[q + 1]) * W;
+    copy<P>(d.C, k.shown, to_out);
+    evaluate_backward<P>(k, s.decoder, M_DECODER, l.decoder_net, at(l.carried), at(l.decoder),
+                         kept, k.shown);
+    P::each(d.H, [&](int64_t i, int) {
+      store<T>(gh + i, load<T>(gh + i) + load<T>(k.shown + i));
+    });
+  } else {
+    const T* weight = c.input_decay;
+    const T* bias = weight + up(d.C, VW);
+    T* to_weight = k.sums + c.map.input_decay_weight_sum;
+    T* to_bias = k.sums + c.map.input_decay_bias_sum;
+    P::each_unit(d.C, [&](int64_t i, int, int n) {
+      const V delta = load<T>(f.delta + i), mean = P::constant(f.mean, n);
+      const V raw = fma(P::constant(weight, n), delta, P::constant(bias, n));
+      const V gamma = exp_(raw < T(0) ? splat(0) : -raw);
+      V to_raw = -gamma * load<T>(k.shown + i) * (load<T>(f.last + i) - mean);
+      to_raw = raw >= T(0) ? to_raw : splat(0);
+      to_raw = load<T>(f.mask + i) != T(0) ? splat(0) : to_raw;
+      store<T>(to_weight + n * VW, load<T>(to_weight + n * VW) + to_raw * delta);
+      store<T>(to_bias + n * VW, load<T>(to_bias + n * VW) + to_raw);
+    });
+  }
+}
+
+template <class P>
+static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stages, T* kept) {
+  const Context<P>& c = k.c;
+  const Spec& s = c.s;
+  const Layout<P>& l = c.l;
+  constexpr int W = P::W;
+  const int driven = c.map.d.D;
+  const int64_t size = int64_t(driven) * W;
+  T* to_stage = k.stage_gradients;
+  for (int j = s.stages - 1; j >= 0; --j) {
+    T* own = kept + int64_t(j) * k.slots.field_size * W;
+    T* to_slope = own + int64_t(k.slots.field_size - driven) * W;
+    P::each(driven, [&](int64_t i, int lane) {
+      V sum = T(s.b[j]) * load<T>(g + i);
+      for (int q = j + 1; q < s.stages; ++q)
+        if (s.a[q][j] != 0) sum = fma(splat(T(s.a[q][j])), load<T>(to_stage + q * size + i), sum);
+      store<T>(to_slope + i, sum * load<T>(span + lane));
+    });
+    const T* stage = stages + int64_t(j) * l.stage_size * W;
+    evaluate_backward<P>(k, s.field, M_FIELD, l.field_net, stage, stage + int64_t(l.network) * W,
+                         own, to_stage + j * size);
+  }
+  P::each(driven, [&](int64_t i, int) {
+    V sum = load<T>(g + i);
+    for (int j = 0; j < s.stages; ++j) sum += load<T>(to_stage + j * size + i);
+    store<T>(g + i, sum);
+  });
+}
+
+// Fills the gradient of the gates; turns those of h and of the memory into the ones before.
+template <class P>
+static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* gh, T* gc) {
+  const Context<P>& c = k.c;
+  const Spec& s = c.s;
+  const Dims& d = c.map.d;
+  const Layout<P>& l = c.l;
+  constexpr int W = P::W;
+  const int64_t n = int64_t(d.H) * W;
+  const T* h = tape + int64_t(l.before + l.h_at) * W;
+  const T* memory = tape + int64_t(l.before + l.c_at) * W;
+  const T* gate = tape + int64_t(l.gate) * W;
+  const T* held = tape + int64_t(l.held) * W;
+  T* to_gate = slot + int64_t(k.slots.gate) * W;
+
+  if (s.cell == CELL_SET) {
+    P::each(d.H, [&](int64_t i, int lane) {
+      const V on = load<T>(f.update + lane), g = load<T>(gh + i);
+      store<T>(to_gate + i, g * on);
+      store<T>(gh + i, g * (1 - on));
+    });
+    return;
+  }
+  if (s.cell == CELL_ELMAN || s.cell == CELL_LSTM) {
+    P::each(d.H, [&](int64_t i, int lane) {
+      const V on = load<T>(f.update + lane), off = 1 - on, g = load<T>(gh + i);
+      store<T>(gh + i, g * off);
+      if (s.cell == CELL_ELMAN) {
+        const V fresh = load<T>(gate + i);
+        store<T>(to_gate + i, g * on * fma(-fresh, fresh, splat(1)));
+        return;
+      }
+      const V forget = load<T>(gate + i), insert = load<T>(gate + n + i);
+      const V node = load<T>(gate + 2 * n + i), output = load<T>(gate + 3 * n + i);
+      const V bent = load<T>(held + i), g2 = load<T>(gc + i), new_h = g * on;
+      const V to_fresh = fma(new_h * output, fma(-bent, bent, splat(1)), g2 * on);
+      store<T>(gc + i, fma(to_fresh, forget, g2 * off));
+      store<T>(to_gate + i, to_fresh * load<T>(memory + i) * forget * (1 - forget));
+      store<T>(to_gate + n + i, to_fresh * node * insert * (1 - insert));
+      store<T>(to_gate + 2 * n + i, to_fresh * insert * fma(-node, node, splat(1)));
+      store<T>(to_gate + 3 * n + i, new_h * bent * output * (1 - output));
+    });
+    k.push(M_REC, to_gate, h);
+    P::template transposed<true>(c.map.m[M_REC], c.packed, to_gate, gh);
+    return;
+  }
+  T* to_held = slot + int64_t(k.slots.held) * W;
+  T* to_reset = k.z;
+  P::each(d.H, [&](int64_t i, int lane) {
+    const V on = load<T>(f.update + lane), g = load<T>(gh + i), update = load<T>(gate + i);
+    const V candidate = load<T>(gate + 2 * n + i), share = update * on;
+    const V to_candidate = g * share * fma(-candidate, candidate, splat(1));
+    store<T>(to_gate + i, g * on * (candidate - load<T>(h + i)) * update * (1 - update));
+    store<T>(to_gate + 2 * n + i, to_candidate);
+    store<T>(gh + i, g - g * share);
+    if (s.reset_after) {
+      const V r = load<T>(gate + n + i);
+      store<T>(to_held + i, to_candidate * r);
+      store<T>(to_gate + n + i, to_candidate * load<T>(held + i) * r * (1 - r));
+    }
+  });
+  if (s.reset_after) {
+    k.push(M_CAND, to_held, h);
+    P::template transposed<true>(c.map.m[M_CAND], c.packed, to_held, gh);
+  } else {
+    k.push(M_CAND, to_gate + 2 * n, held);
+    P::template transposed<false>(c.map.m[M_CAND], c.packed, to_gate + 2 * n, to_reset);
+    P::each(d.H, [&](int64_t i, int) {
+      const V r = load<T>(gate + n + i), g = load<T>(to_reset + i);
+      store<T>(to_gate + n + i, g * load<T>(h + i) * r * (1 - r));
+      store<T>(gh + i, fma(g, r, load<T>(gh + i)));
+    });
+  }
+  k.push(M_REC, to_gate, h);
+  P::template transposed<true>(c.map.m[M_REC], c.packed, to_gate, gh);
+}
+
+static int widest_input(const Map& map) {
+  int n = 0;
+  for (int i = 0; i < M_END; ++i)
+    if (map.used[i] && up(map.m[i].in, VW) > n) n = up(map.m[i].in, VW);
+  return n;
+}
+
+static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
+  using P = Many<2>;
+  const Map p = map(s);
+  const Dims& d = p.d;
+  const int64_t per_row = tape_row(s, max_steps, 2) + facts_size(d, P::W) +
+                          int64_t(slots(s, d, max_steps).size) * P::W;
+  return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W * 2 +
+         int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * s.stages) * P::W +
+         int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
+}
+
+template <class P>
+static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratch) {
+  const Spec& s = *job.spec;
+  const Map p = map(s);
+  const Dims& d = p.d;
+  const Slots places = slots(s, d, job.max_steps);
+  T* at = scratch;
+  auto take = [&](int64_t n) {
+    T* here = at;
+    at += n;
+    return here;
+  };
+  const int64_t W = P::W;
+  T* g = take(d.S * W);
+  T* state = take(d.S * W);
+  const Context<P> c = context<P>(job, p, take(work_size<P>(s)));
+  const int64_t row_size = int64_t(c.l.size) * W, slot_size = int64_t(places.size) * W;
+  const int64_t fact_size = facts_size(d, P::W);
+  Pairs pairs;
+  T* z = take((widest<P>(s) + d.H) * W);  // the carried gradient of a decay lies behind it
+  T* shown = take((d.C > d.H ? d.C : d.H) * W);
+  T* stage_gradients = take(int64_t(d.D) * s.stages * W);
+  T* xt = take(int64_t(PAIRS_AT_ONCE) * W * widest_input(p));
+  Back<P> k{c, places, pairs, sums, xt, z, shown, stage_gradients};
+  T* lanes = take(fact_size * job.group);
+  T* gradients = take(slot_size * job.group);
+  T* own = job.tape ? nullptr : take(row_size * job.group);
+
+  zero(g, d.S * W);
+  for (int64_t row = job.n_rows - 1; row >= b.rows; --row) {
+    collect<P>(job, b, job.to_after, int(row), d.S, true, g);
+    collect<P>(job, b, job.to_before, int(row), d.S, true, g);
+  }
+  Facts<P> f[MAX_GROUP];
+  for (int last = b.rows; last > 0; last -= job.group) {
+    const int first = last > job.group ? last - job.group : 0;
+    if (!job.tape) {
+      if (first)
+        collect<P>(job, b, job.after, first - 1, d.S, false, state);
+      else
+        first_state<P>(job, b, state);
+    }
+    for (int row = first; row < last; ++row) {
+      f[row - first] = facts<P>(d, lanes + (row - first) * fact_size);
+      gather<P>(job, d, b, row, f[row - first], -job.group);
+      if (!job.tape) row_forward<P>(c, f[row - first], state, own + (row - first) * row_size);
+    }
+    for (int row = last - 1; row >= first; --row) {
+      const T* tape =
+          job.tape ? job.tape + b.tape + row * row_size : own + (row - first) * row_size;
+      collect<P>(job, b, job.to_after, row, d.S, true, g);
+      row_backward<P>(k, f[row - first], tape, gradients + (row - first) * slot_size, g, job, b,
+                      row);
+    }
+    flush(p, pairs, P::W, sums, xt);
+  }
+  if (job.to_state) {
+    Grid<T> grid{job.to_state, d.S, 0};
+    scatter<P>(job, b, grid, 0, g, d.S);
+  }
+}
+
+static void backward(const Job<T>& job, int slot, T* scratch) {
+  const int64_t size = sums_size(*job.spec);
+  T* sums = job.sums + slot * size;
+  zero(sums, size);
+  for (int i = job.slots[slot].first; i < job.slots[slot].last; ++i) {
+    const Block& b = job.blocks[i];
+    if (b.vectors == 2)
+      block_backward<Many<2>>(job, b, sums, scratch);
+    else
+      block_backward<Many<1>>(job, b, sums, scratch);
+  }
+}
+
+static void reduce_matrix(const Matrix& m, const T* sums, T* flat) {
+  const int in = up(m.in, VW);
+  for (int o = 0; o < m.out; ++o)
+    for (int k = 0; k < m.in; ++k)
+      flat[m.weight + int64_t(o) * m.in + k] += sums[m.sum + int64_t(o) * in + k];
+  if (m.bias >= 0) reduce_lanes(sums + m.bias_sum, m.out, flat + m.bias);
+}
+static void reduce_lanes(const T* sums, int units, T* flat) {
+  for (int u = 0; u < units; ++u) {
+    T total = 0;
+    for (int i = 0; i < VW; ++i) total += sums[int64_t(u) * VW + i];
+    flat[u] += total;
+  }
+}
+
+// Slots are added in their order, whoever filled them.
+static void reduce(const Spec& s, const T* sums, int n, T* flat) {
+  const Map p = map(s);
+  zero(flat, p.flat);
+  for (int slot = 0; slot < n; ++slot, sums += p.sums) {
+    for (int i = 0; i < M_END; ++i)
+      if (p.used[i]) reduce_matrix(p.m[i], sums, flat);
+    if (!s.input_decay) continue;
+    reduce_lanes(sums + p.input_decay_weight_sum, p.d.C, flat + p.input_decay_weight);
+    reduce_lanes(sums + p.input_decay_bias_sum, p.d.C, flat + p.input_decay_bias);
+  }
+}

@@ -1,0 +1,22 @@
+#include <math.h>
+#include <stddef.h>
+
+#include <initializer_list>
+
+#include "scan.hpp"
+#if defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
+#define VECTOR_BYTES 16
+
+namespace offbeat {
+namespace {
+#include "vector.hpp"
+#include "body.hpp"
+#include "body_table.hpp"
+}  // namespace
+
+extern const Bodies body_baseline;
+constexpr Bodies body_baseline = {"baseline", table<float>(), table<double>()};
+}  // namespace offbeat

@@ -1,0 +1,191 @@
+"""Clocks of logs: units of time, stated or found, and integer nanoseconds.
+
+A clock that counts from 1970 in float64 seconds has steps of 0.24 us, in float32 of 128 s. So
+stamps are kept as integers until the start is taken off, and are seconds only then.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from offbeat.errors import FileFormatError, InputError, one_of
+
+NANOSECONDS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "100ns": 100, "ns": 1}
+"""Units of time that a file may count in."""
+
+_SPELLINGS = {
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "ms": ("ms", "msec", "millis", "millisecond", "milliseconds"),
+    "us": ("us", "µs", "usec", "micros", "microsecond", "microseconds"),
+    "100ns": ("100ns", "100 ns"),
+    "ns": ("ns", "nsec", "nanos", "nanosecond", "nanoseconds"),
+}
+_UNIT_OF = {spelling: unit for unit, names in _SPELLINGS.items() for spelling in names}
+
+_STEMS = ("time", "t", "timestamp", "stamp", "clock")
+TIME_NAMES = (*_STEMS, *(f"{stem}_{unit}" for stem in _STEMS for unit in NANOSECONDS_PER))
+"""Names, in any case, that make a column the time; the first of them that a file has. Those with a
+unit say it; so does a unit in brackets, as in `t [ns]` and `Time (ms)`."""
+
+_BRACKETS = re.compile(r"(.*?)\s+(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+_FIRST_YEAR, _LAST_YEAR = 946_684_800, 4_102_444_800  # 2000 and 2100, in seconds since 1970
+_EPOCHS = {  # units in which a clock can count, and seconds from its zero to 1970
+    "seconds since 1970": ("s", 0),
+    "milliseconds since 1970": ("ms", 0),
+    "microseconds since 1970": ("us", 0),
+    "ticks of 100 ns since 1970": ("100ns", 0),
+    "nanoseconds since 1970": ("ns", 0),
+    "ticks of 100 ns since 1601": ("100ns", 11_644_473_600),
+    "ticks of 100 ns since the year 1": ("100ns", 62_135_596_800),
+}
+_SLOWEST_S = 10.0  # a median step that is longer in seconds is taken for another unit
+_TYPICAL_HZ = 100.0
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Name and unit of a column: `speed [m/s]` is `("speed", "m/s")`; no unit is empty."""
+    match = _BRACKETS.fullmatch(name.strip())
+    if match is None or not match[1]:
+        return name.strip(), ""
+    return match[1], (match[2] or match[3] or "").strip()
+
+
+def time_unit_in(name: str) -> str | None:
+    """The unit that the name of a time column says (`time_ms`, `t [ns]`), or None."""
+    stem, unit = split_unit(name)
+    said = unit.casefold() or stem.casefold().rpartition("_")[2]
+    return _UNIT_OF.get(said) if unit or "_" in stem else None
+
+
+def time_column_of(names: list[str]) -> str | None:
+    """The column that is the time, by its name, or None."""
+    stems = {name: split_unit(name)[0].casefold().lstrip("#").strip() for name in names}
+    for usual in TIME_NAMES:
+        for name, stem in stems.items():
+            if stem == usual:
+                return name
+    spelt = (n for n, stem in stems.items() if time_unit_in(n) and stem.split("_")[0] in _STEMS)
+    return next(spelt, None)
+
+
+def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
+    """The unit of a clock by its numbers alone, and in words why.
+
+    A clock of today tells its unit by its size, for a number of 2000 to 2100 fits one unit alone:
+    seconds, milliseconds, microseconds, nanoseconds or ticks of 100 ns since 1970, or ticks since
+    1601 (Windows) or the year 1 (.NET). A clock that counts from elsewhere is in seconds, unless
+    its median step would then be longer than 10 s and three steps or more agree: then it is in the
+    unit, of `ms`, `us` and `ns`, that brings the rate nearest to 100 Hz.
+
+    Args:
+        clock: (n,) numbers, in the order of the log.
+
+    Returns:
+        The unit, and the reason for messages; the reason is empty where seconds are assumed for
+        want of a reason against them.
+    """
+    numbers = np.asarray(clock, dtype=np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    if not numbers.size:
+        return "s", ""
+    middle = float(np.median(numbers))
+    for meaning, (unit, before) in _EPOCHS.items():
+        seconds = middle / (10**9 / NANOSECONDS_PER[unit]) - before
+        if _FIRST_YEAR <= seconds <= _LAST_YEAR:
+            return unit, f"numbers near {middle:.3g} are {meaning}"
+    steps = np.diff(numbers)
+    steps = steps[steps > 0]
+    if len(steps) < 3 or np.median(steps) <= _SLOWEST_S:
+        return "s", ""
+    step = float(np.median(steps))
+    rates = {unit: 1e9 / NANOSECONDS_PER[unit] / step for unit in ("ms", "us", "ns")}
+    unit = min(rates, key=lambda u: abs(np.log(rates[u] / _TYPICAL_HZ)))
+    return (
+        unit,
+        f"a median step of {step:g} would be a row every {step:g} s, not {rates[unit]:g} Hz",
+    )
+
+
+def state_time_unit(
+    given: str | None, name: str, clock: ArrayLike, where: str
+) -> tuple[str, tuple[str, ...]]:
+    """The unit of a clock: as given, else as its name says, else found by its numbers.
+
+    Args:
+        given: the option `time_unit`, or None.
+        name: of the column, which may say a unit.
+        clock: (n,) some of its numbers.
+        where: the file, for messages.
+
+    Returns:
+        The unit, and what is to be said aloud: that it was found, and how to state it.
+
+    Raises:
+        InputError: the unit that is given is unknown, or the name says another one.
+    """
+    said = time_unit_in(name)
+    if given is not None:
+        one_of("time unit", given, NANOSECONDS_PER)
+        if said not in (None, given):
+            raise InputError(
+                f"{where}: the column {name!r} says that times are in {said}, time_unit says "
+                f"{given}; leave time_unit out, or rename the column"
+            )
+        return given, ()
+    if said is not None:
+        return said, ()
+    found, why = find_time_unit(clock)
+    if not why:
+        return found, ()
+    return found, (f"time is taken to be in {found}: {why}; state it with time_unit",)
+
+
+def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], int]:
+    """Integer nanoseconds of a clock, and what the clock shows at nanosecond 0.
+
+    Integers keep every bit. Floats are rounded to whole nanoseconds, after their whole part at the
+    start is taken off. The second result is 0, but where nanoseconds since the clock's own zero
+    exceed an int64, as ticks of 100 ns since 1601 do.
+
+    Args:
+        clock: (n,) integers or floats, in `unit`.
+        unit: one of `NANOSECONDS_PER`.
+
+    Raises:
+        FileFormatError: a time is not finite, or the times span more than 292 years.
+    """
+    factor = NANOSECONDS_PER[one_of("time unit", unit, NANOSECONDS_PER)]
+    clock = np.asarray(clock)
+    if not clock.size:
+        return np.zeros(0, dtype=np.int64), 0
+    zero = 0
+    if clock.dtype.kind in "iu":
+        low, high = int(clock.min()), int(clock.max())
+        if max(abs(low), abs(high)) * factor >= 2**63:
+            zero = int(clock[0])
+            if max(abs(low - zero), abs(high - zero)) * factor >= 2**63:
+                raise FileFormatError(
+                    f"times from {low} to {high} {unit} span more than 292 years; give the unit "
+                    "that they are in with time_unit"
+                )
+            clock = clock - clock.dtype.type(zero)
+        return clock.astype(np.int64) * factor, zero
+    floats = clock.astype(np.float64)
+    bad = ~np.isfinite(floats)
+    if bad.any():
+        row = int(bad.argmax())
+        raise FileFormatError(
+            f"times must be finite seconds, got {floats[row]} at row {row}; drop that row"
+        )
+    whole = float(np.floor(floats[0]))
+    since = np.rint((floats - whole) * factor)
+    if np.abs(since).max() >= 2.0**62 or abs(whole) * factor >= 2.0**62:
+        raise FileFormatError(
+            f"times from {floats.min():g} to {floats.max():g} {unit} exceed the 146 years that "
+            "nanoseconds can count; give the unit that they are in with time_unit"
+        )
+    return since.astype(np.int64) + int(whole) * factor, zero

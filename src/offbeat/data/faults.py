@@ -1,0 +1,175 @@
+"""Faults of clocks: rows out of order, stamps that repeat, clocks that are set, outages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Stamps = NDArray[np.int64]
+Values = NDArray[np.float64]
+
+_DAY = 86_400 * 10**9
+_SECOND = 10**9
+_FEW_STEPS = 20
+_LATE_ROWS = 10  # rows after which a stamp that is late, and not set back, is over
+
+
+@dataclass(frozen=True, eq=False)
+class Disorder:
+    """What is wrong with the order of stamps.
+
+    Attributes:
+        late: stamps of the rows that are lower than one before them.
+        duplicates: stamps of the rows that have that of another row.
+    """
+
+    late: Stamps
+    duplicates: Stamps
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a fault."""
+        return len(self.late) + len(self.duplicates) > 0
+
+
+_IN_ORDER = Disorder(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+
+
+def disorder(stamps: Stamps) -> Disorder:
+    """Finds rows that are late and stamps that repeat."""
+    if (np.diff(stamps) > 0).all():
+        return _IN_ORDER
+    ordered = np.sort(stamps)
+    return Disorder(
+        stamps[stamps < np.maximum.accumulate(stamps)], ordered[1:][np.diff(ordered) == 0]
+    )
+
+
+def clock_jumps(stamps: Stamps) -> Stamps:
+    """Rows at which the clock was set: back for good, or forth by more than a day (and 20 steps).
+
+    A step back counts if it is longer than a second and than 20 median steps, and if none of the
+    10 rows that follow reaches the old clock again; else the row is late, and not the clock wrong.
+    Where more than 1 row in 100 steps back so, the log has no order, rather than many clocks.
+    """
+    steps = np.diff(stamps)
+    if not len(steps) or ((steps >= 0) & (steps <= _DAY)).all():
+        return np.zeros(0, dtype=np.int64)
+    forward = steps[steps > 0]
+    usual = int(np.median(forward)) if len(forward) else 0
+    back = np.flatnonzero(steps < -max(_SECOND, 20 * usual)) + 1
+    if len(back) > max(3, len(stamps) // 100):
+        back = back[:0]
+    after = np.minimum(back[:, None] + np.arange(1, _LATE_ROWS + 1), len(stamps) - 1)
+    stays = (stamps[after] < stamps[back - 1][:, None]).all(axis=1)
+    # At the very end there is nothing after it to tell by.
+    back = back[stays & (back < len(stamps) - 1)]
+    far = max(_DAY, 20 * usual)
+    forth = np.flatnonzero(steps > far) + 1
+    # A forward step that merely ends a late stamp is none.
+    reached = np.maximum.accumulate(stamps)
+    forth = forth[stamps[forth] - reached[forth - 1] > far]
+    return np.union1d(back, forth)
+
+
+def in_order(
+    stamps: Stamps, values: Values, policy: Literal["sort", "drop", "refuse"]
+) -> tuple[Stamps, Values]:
+    """Stamps that do not decrease, with their values; `refuse` is up to the caller."""
+    if (np.diff(stamps) >= 0).all():
+        return stamps, values
+    if policy == "drop":
+        kept = stamps >= np.maximum.accumulate(stamps)
+        return stamps[kept], values[kept]
+    order = np.argsort(stamps, kind="stable")
+    return stamps[order], values[order]
+
+
+def one_row_per_stamp(
+    stamps: Stamps, values: Values, policy: Literal["last", "first", "mean", "refuse"]
+) -> tuple[Stamps, Values]:
+    """Merges rows of one stamp, channel by channel, over the cells that are known."""
+    starts = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1) != 0)
+    if len(starts) == len(stamps):
+        return stamps, values
+    return stamps[starts], merge_rows(values, starts, policy)
+
+
+def merge_rows(
+    values: Values, starts: NDArray[np.int64], policy: Literal["last", "first", "mean", "refuse"]
+) -> Values:
+    """One row per group of rows: the `last` or `first` known cell per channel, or the `mean`.
+
+    Args:
+        values: (n, channels) NaN = missing.
+        starts: (groups,) first row of each group, increasing from 0.
+        policy: which; `refuse` is taken as `last`.
+
+    Returns:
+        (groups, channels).
+    """
+    merged = np.empty((len(starts), values.shape[1]), order="F")
+    rows = np.arange(len(values))
+    for c in range(values.shape[1]):  # column by column: the memory of one column beside it
+        column = values[:, c]
+        known = ~np.isnan(column)
+        if policy == "mean":
+            total = np.add.reduceat(np.where(known, column, 0.0), starts)
+            count = np.add.reduceat(known.astype(np.int64), starts)
+            merged[:, c] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+        elif policy == "first":
+            at = np.minimum.reduceat(np.where(known, rows, len(values) - 1), starts)
+            own = known[at] & (at < np.append(starts[1:], len(values)))
+            merged[:, c] = np.where(own, column[at], np.nan)
+        else:
+            at = np.maximum.reduceat(np.where(known, rows, -1), starts)
+            merged[:, c] = np.where(at >= 0, column[at], np.nan)
+    return merged
+
+
+def union(signals: list[tuple[Stamps, Values, list[int]]], channels: int) -> tuple[Stamps, Values]:
+    """Merges signals on the union of their stamps; what a signal did not say at a stamp is NaN.
+
+    Args:
+        signals: stamps that increase strictly, values, and the channel of each column.
+        channels: their number in all.
+
+    Returns:
+        (rows,) stamps and (rows, channels) values; the arrays of a lone signal are not copied.
+    """
+    if len(signals) == 1:
+        stamps, values, columns = signals[0]
+        if columns == list(range(channels)):
+            return stamps, values
+    stamps = signals[0][0]
+    for others, _, _ in signals[1:]:
+        if len(others) != len(stamps) or not np.array_equal(others, stamps):
+            stamps = np.unique(np.concatenate([s for s, _, _ in signals]))
+            break
+    merged = np.full((len(stamps), channels), np.nan, order="F")
+    for own, values, columns in signals:
+        rows: Any = slice(None) if len(own) == len(stamps) else np.searchsorted(stamps, own)
+        for c, column in enumerate(columns):
+            merged[rows, column] = values[:, c]
+    return stamps, merged
+
+
+def longest_allowed(stamps: Stamps, max_gap_s: float | Literal["auto"] | None) -> int | None:
+    """Nanoseconds above which a step is an outage; None where none is.
+
+    `auto` is 20 times the 99th percentile of the steps, the longest one left out, and at least 1 s;
+    fewer than 20 steps say too little of what is usual, and none of them is an outage.
+    """
+    if max_gap_s is None:
+        return None
+    if max_gap_s != "auto":
+        return round(min(float(max_gap_s) * 1e9, 2.0**62))
+    steps = np.diff(stamps)
+    if len(steps) < _FEW_STEPS:
+        return None
+    rank = min(math.ceil(0.99 * (len(steps) - 1)), len(steps) - 2)
+    return max(_SECOND, 20 * int(np.partition(steps, rank)[rank]))

@@ -1,0 +1,242 @@
+"""What a log holds: rates, jitter, gaps, held values and faults, and what to make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.mend import find_held
+from offbeat.data.policies import sentences
+from offbeat.data.trajectory import Dataset
+
+
+@dataclass(frozen=True)
+class ChannelFacts:
+    """What is known of a channel, over all episodes together.
+
+    Attributes:
+        name: of the channel.
+        unit: or empty.
+        cells: known cells.
+        missing: share of the rows in which it is not known.
+        rate_hz: one over the median time between two known cells; None below two.
+        jitter_s: half the distance from the 5th to the 95th percentile of those times.
+        lost: share of the cells that its rate would give between its first and last one, and that
+            are not there; 0 where there are more.
+        longest_gap_s: the longest time between two known cells of an episode.
+        longest_gap_at: the episode, counted from 0, and the time in it at which that gap begins.
+        rows_per_value: where it is held, the usual run of equal values, else 0.
+        held_share: share of known cells that repeat the one before.
+        low: its least value; None where it is never known.
+        high: its greatest.
+        mean: its mean.
+        constant: whether it has one value alone.
+    """
+
+    name: str
+    unit: str
+    cells: int
+    missing: float
+    rate_hz: float | None
+    jitter_s: float | None
+    lost: float
+    longest_gap_s: float | None
+    longest_gap_at: tuple[int, float] | None
+    rows_per_value: int
+    held_share: float
+    low: float | None
+    high: float | None
+    mean: float | None
+    constant: bool
+
+
+@dataclass(frozen=True)
+class EpisodeFacts:
+    """What is known of an episode.
+
+    Attributes:
+        label: as the file has it, or empty.
+        origin: where it came from.
+        rows: of all its channels together.
+        duration_s: from the first to the last row.
+        longest_step_s: the longest time between two rows.
+        outage_before_s: the outage at which it was cut from the episode before; None where none is.
+        clock_set_before: whether the clock was set before it.
+        late: rows that came out of order.
+        duplicates: rows that had the stamp of another.
+    """
+
+    label: str
+    origin: str
+    rows: int
+    duration_s: float
+    longest_step_s: float
+    outage_before_s: float | None = None
+    clock_set_before: bool = False
+    late: int = 0
+    duplicates: int = 0
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a log holds.
+
+    Attributes:
+        source: the file, where it is known.
+        format: of the file.
+        time_unit: that the file counts in.
+        rows: of all episodes together.
+        observed: share of the cells that are known.
+        rate_hz: one over the median time between two rows; None where no episode has two.
+        channels: one entry each.
+        episodes: one entry each.
+        found: what the policies found and did, a sentence each.
+        report: the same in full, see `Policies`; empty for data that were not read from a log.
+    """
+
+    source: str
+    format: str
+    time_unit: str
+    rows: int
+    observed: float
+    rate_hz: float | None
+    channels: tuple[ChannelFacts, ...]
+    episodes: tuple[EpisodeFacts, ...]
+    found: tuple[str, ...]
+    report: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form."""
+        plain = asdict(self)
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in plain.items()}
+
+
+def inspect(dataset: Dataset) -> Inspection:
+    """Measures what a log holds, on the cells that are known.
+
+    Args:
+        dataset: as `read` gives it.
+    """
+    steps = np.concatenate([np.diff(t.times) for t in dataset])
+    rows = sum(t.rows for t in dataset)
+    channels = tuple(_channel(dataset, c, rows) for c in range(dataset.channels))
+    cells = sum(channel.cells for channel in channels)
+    report = dict(dataset.meta.get("report", {}))
+    return Inspection(
+        source=str(dataset.meta.get("source", "")),
+        format=str(dataset.meta.get("format", "offbeat")),
+        time_unit=str(dataset.meta.get("time_unit", "s")),
+        rows=rows,
+        observed=cells / (rows * dataset.channels),
+        rate_hz=_rate(steps),
+        channels=channels,
+        episodes=_episodes(dataset, report),
+        found=tuple(sentences(report)) if report else (),
+        report=report,
+    )
+
+
+def _channel(dataset: Dataset, c: int, rows: int) -> ChannelFacts:
+    columns = [t.values[:, c] for t in dataset]
+    known = [np.flatnonzero(~np.isnan(column)) for column in columns]
+    steps = [np.diff(t.times[at]) for t, at in zip(dataset, known, strict=True)]
+    together = np.concatenate(steps)
+    cells = sum(len(at) for at in known)
+    facts = {"name": dataset.names[c], "unit": dataset.units[c], "cells": cells}
+    if not cells:
+        return ChannelFacts(
+            **facts,  # type: ignore[arg-type]
+            missing=1.0,
+            rate_hz=None,
+            jitter_s=None,
+            lost=0.0,
+            longest_gap_s=None,
+            longest_gap_at=None,
+            rows_per_value=0,
+            held_share=0.0,
+            low=None,
+            high=None,
+            mean=None,
+            constant=False,
+        )
+    values = [column[at] for column, at in zip(columns, known, strict=True) if len(at)]
+    low = min(float(v.min()) for v in values)
+    high = max(float(v.max()) for v in values)
+    repeats = sum(int(np.count_nonzero(v[1:] == v[:-1])) for v in values)
+    held = None if low == high else find_held(columns)
+    gap, at = _longest(dataset, steps, known)
+    return ChannelFacts(
+        **facts,  # type: ignore[arg-type]
+        missing=1 - cells / rows,
+        rate_hz=_rate(together),
+        jitter_s=_jitter(together),
+        lost=_lost(together),
+        longest_gap_s=gap,
+        longest_gap_at=at,
+        rows_per_value=0 if held is None else held.rows_per_value,
+        held_share=repeats / max(sum(len(v) - 1 for v in values), 1),
+        low=low,
+        high=high,
+        mean=sum(float(v.sum()) for v in values) / cells,
+        constant=low == high,
+    )
+
+
+def _longest(
+    dataset: Dataset, steps: Sequence[NDArray[np.float64]], known: Sequence[NDArray[np.int64]]
+) -> tuple[float | None, tuple[int, float] | None]:
+    longest = [float(own.max()) if len(own) else -1.0 for own in steps]
+    episode = int(np.argmax(longest))
+    if longest[episode] < 0:
+        return None, None
+    row = known[episode][int(np.argmax(steps[episode]))]
+    return longest[episode], (episode, float(dataset[episode].times[row]))
+
+
+def _rate(steps: NDArray[np.float64]) -> float | None:
+    return 1 / float(np.median(steps)) if len(steps) else None
+
+
+def _jitter(steps: NDArray[np.float64]) -> float | None:
+    if not len(steps):
+        return None
+    low, high = np.quantile(steps, [0.05, 0.95])
+    return float(high - low) / 2
+
+
+def _lost(steps: NDArray[np.float64]) -> float:
+    """Share of the cells that the median step would give, and that are not there."""
+    if not len(steps):
+        return 0.0
+    expected = float(steps.sum()) / float(np.median(steps))
+    return max(0.0, 1 - len(steps) / expected)
+
+
+def _episodes(dataset: Dataset, report: dict[str, Any]) -> tuple[EpisodeFacts, ...]:
+    faults = {entry["episode"]: entry for entry in report.get("episodes", ())}
+    labels = dataset.meta.get("labels", [""] * len(dataset))
+    # A part of the data, such as a split, has fewer trajectories than the report is of.
+    if len(labels) != len(dataset) or any(i >= len(dataset) for i in faults):
+        labels, faults = [""] * len(dataset), {}
+    facts = []
+    for i, trajectory in enumerate(dataset):
+        own = faults.get(i, {})
+        steps = np.diff(trajectory.times)
+        facts.append(
+            EpisodeFacts(
+                label=str(labels[i]),
+                origin=trajectory.origin,
+                rows=trajectory.rows,
+                duration_s=float(trajectory.times[-1] - trajectory.times[0]),
+                longest_step_s=float(steps.max()) if len(steps) else 0.0,
+                outage_before_s=own.get("outage_before_s"),
+                clock_set_before=bool(own.get("clock_set_before", False)),
+                late=int(own.get("late", 0)),
+                duplicates=int(own.get("duplicates", 0)),
+            )
+        )
+    return tuple(facts)

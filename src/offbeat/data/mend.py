@@ -1,0 +1,164 @@
+"""Faults of channels: values held on a faster grid, angles that wrap, quaternions that flip."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+
+HELD_SHARE = 0.5
+"""Share of rows that repeat the value before them, from which on a channel can be held."""
+
+_FEWEST_RUNS = 10
+_QUATERNION = re.compile(r"(.*?)(?:^|[._\s\-/]|(?<=q)|(?<=quat)|(?<=quaternion))([wxyz])")
+_ROTATION = re.compile(r"q$|quat|orient|rotation|attitude|(^|[._\s\-/])q", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A channel of a slower sensor that a faster log repeats.
+
+    Attributes:
+        share: of its known cells that repeat the one before.
+        rows_per_value: the usual (median) length of its runs of equal values, 2 or more.
+    """
+
+    share: float
+    rows_per_value: int
+
+
+def find_held(columns: Sequence[Values]) -> Held | None:
+    """Says whether a channel is held.
+
+    Held is a channel at least half of whose known cells repeat the one before, in 10 runs of equal
+    values or more whose median length is 2 or more. One that rests, and between its rests changes
+    at every row, has mostly short runs, and is not held; a constant has no run that ends.
+
+    Args:
+        columns: (rows,) its values in each episode, NaN = missing.
+    """
+    columns = [_known(column) for column in columns]
+    cells = sum(len(column) - 1 for column in columns if len(column))
+    repeats = sum(int(np.count_nonzero(column[1:] == column[:-1])) for column in columns)
+    if not cells or repeats < HELD_SHARE * cells:
+        return None
+    lengths: list[NDArray[np.int64]] = []
+    for column in columns:
+        if len(column):
+            changes = np.flatnonzero(column[1:] != column[:-1]) + 1
+            lengths.append(np.diff(changes, prepend=0))  # without the last run, which is cut off
+    runs = np.concatenate(lengths)
+    if len(runs) < _FEWEST_RUNS:
+        return None
+    usual = int(np.median(runs))
+    return Held(repeats / cells, usual) if usual >= 2 else None
+
+
+def _known(column: Values) -> Values:
+    missing = np.isnan(column)
+    return column[~missing] if missing.any() else column
+
+
+def measured_anew(column: Values, held: int) -> NDArray[np.bool_]:
+    """Where a held channel was measured: at each change, and every `held` rows while it rests.
+
+    Args:
+        column: (n,) NaN = missing.
+        held: rows per value.
+
+    Returns:
+        (n,) True at known cells that are no repeats.
+    """
+    at = np.flatnonzero(~np.isnan(column))
+    fresh = np.zeros(len(column), dtype=bool)
+    if len(at):
+        known = column[at]
+        new = np.append(True, known[1:] != known[:-1])
+        starts = np.flatnonzero(new)
+        since = np.arange(len(at)) - np.repeat(starts, np.diff(np.append(starts, len(at))))
+        fresh[at] = since % held == 0
+    return fresh
+
+
+def unwrap(column: Values, period: float) -> int:
+    """Takes jumps by more than half a turn out of an angle, in place; says how many there were."""
+    known = ~np.isnan(column)
+    angles = column[known]
+    if len(angles) < 2:
+        return 0
+    turns = np.round(np.diff(angles) / period)
+    jumps = int(np.count_nonzero(turns))
+    if jumps:
+        column[known] = angles - period * np.append(0.0, np.cumsum(turns))
+    return jumps
+
+
+@dataclass(frozen=True)
+class Mended:
+    """What was done to the rows of a quaternion.
+
+    Attributes:
+        flipped: rows whose sign follows the row before, and did not.
+        renormalised: rows whose length was off 1 by more than 0.001.
+        dropped: rows of length 0, or with some but not all of four cells, which are missing now.
+    """
+
+    flipped: int
+    renormalised: int
+    dropped: int
+
+
+def mend_quaternion(four: Values) -> Mended:
+    """Makes a quaternion continuous in sign and of length 1, in place.
+
+    Args:
+        four: (n, 4) NaN = missing.
+    """
+    norm = np.sqrt((four * four).sum(axis=1))
+    whole = norm > 1e-6  # False at NaN
+    some = ~np.isnan(four).all(axis=1)
+    four[some & ~whole] = np.nan
+    unit = four[whole] / norm[whole, None]
+    turned = (unit[1:] * unit[:-1]).sum(axis=1) < 0
+    sign = np.where(np.append(0, np.cumsum(turned)) % 2 == 1, -1.0, 1.0)[: len(unit)]
+    four[whole] = unit * sign[:, None]
+    return Mended(
+        int((sign < 0).sum()),
+        int((np.abs(norm[whole] - 1) > 1e-3).sum()),
+        int((some & ~whole).sum()),
+    )
+
+
+def find_quaternions(names: Sequence[str], columns: Iterable[Values]) -> list[int]:
+    """First columns of four in a row that are a quaternion by their names and their length.
+
+    Names end in w, x, y, z or x, y, z, w after one stem that speaks of a rotation (`qx`, `q_w`,
+    `orientation.z`); three rows in four, where all are known, have a length within 0.05 of 1.
+
+    Args:
+        names: of channels.
+        columns: (n,) values of each channel, in the same order.
+    """
+    parts = [_QUATERNION.fullmatch(name.casefold()) for name in names]
+    columns = list(columns)
+    found: list[int] = []
+    for first in range(len(names) - 3):
+        four = parts[first : first + 4]
+        if (found and first < found[-1] + 4) or any(part is None for part in four):
+            continue
+        stems = {part[1] for part in four if part}
+        letters = "".join(part[2] for part in four if part)
+        if len(stems) > 1 or letters not in ("wxyz", "xyzw"):
+            continue
+        if not _ROTATION.search(next(iter(stems))):
+            continue
+        norm = np.sqrt(sum(column**2 for column in columns[first : first + 4]))
+        norm = norm[~np.isnan(norm)]
+        if len(norm) and (np.abs(norm - 1) < 0.05).mean() >= 0.75:
+            found.append(first)
+    return found

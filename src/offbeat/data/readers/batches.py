@@ -1,0 +1,145 @@
+"""Batches of Arrow, gathered column by column: beside the result, one batch is in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.readers.columns import Coder, Columns, Gathered
+from offbeat.errors import FileFormatError
+
+
+class NullCellError(Exception):
+    """A row has no time, or says not to which trajectory or channel it belongs."""
+
+    def __init__(self, column: str, row: int) -> None:
+        super().__init__(column, row)
+        self.column, self.row = column, row
+
+
+def gather(
+    batches: Iterable[Any],
+    columns: Columns,
+    capacity: int,
+    *,
+    widths: Mapping[str, int] = MappingProxyType({}),
+) -> Gathered:
+    """Copies the columns that are needed out of record batches, one batch at a time.
+
+    Args:
+        batches: `pyarrow.RecordBatch`es with the columns `columns.read`.
+        columns: what they are.
+        capacity: at least the number of rows; what is too much costs address space alone.
+        widths: how many channels a column of lists gives.
+
+    Raises:
+        NullCellError: a time, label or key is missing.
+        FileFormatError: the time is of no type that counts.
+        OverflowError: a time of decimals exceeds an int64 of nanoseconds.
+    """
+    # Columns lie one after the other, so that each is filled and looked at in one stretch.
+    channels = sum(widths.get(name, 1) for name in columns.channels)
+    values = np.empty((channels, capacity))
+    clocks: list[NDArray[Any]] = []
+    labels = Coder() if columns.label else None
+    keys = Coder() if columns.key else None
+    rows = 0
+    for batch in batches:
+        for name, coder in ((columns.label, labels), (columns.key, keys)):
+            if coder is not None and name is not None:
+                coder.add(_without_nulls(_text(batch.column(name)), name, rows))
+        clocks.append(clock_of(_without_nulls(batch.column(columns.time), columns.time, rows)))
+        end = rows + batch.num_rows
+        c = 0
+        for name in columns.channels:
+            column, width = batch.column(name), widths.get(name, 1)
+            values[c : c + width, rows:end] = (
+                _lists(column, name, width) if name in widths else _numbers(column)
+            )
+            c += width
+        rows = end
+    clock = np.concatenate(clocks) if clocks else np.zeros(0, dtype=np.int64)
+    return Gathered(
+        clock,
+        labels.done() if labels else None,
+        keys.done() if keys else None,
+        values[:, :rows].T,
+    )
+
+
+def clock_of(column: Any) -> NDArray[Any]:
+    """Integers or floats of an Arrow column of times; decimals are given in nanoseconds.
+
+    A decimal must have as many places as its unit has to a nanosecond (9 for seconds): its digits
+    are then nanoseconds.
+    """
+    import pyarrow as pa
+
+    kind = column.type
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time64(kind):
+        column = column.cast(pa.int64())
+    if pa.types.is_decimal(kind):
+        words = np.frombuffer(column.buffers()[1], dtype=np.int64).reshape(-1, 2)
+        words = words[column.offset : column.offset + len(column)]
+        if (words[:, 1] != words[:, 0] >> 63).any():
+            raise OverflowError("a time exceeds an int64 of nanoseconds")
+        return words[:, 0]
+    return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+def _numbers(column: Any) -> NDArray[Any]:
+    """Float64, null = NaN."""
+    import pyarrow as pa
+
+    if not pa.types.is_float64(column.type):
+        column = column.cast(pa.float64(), safe=False)
+    return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+def _lists(column: Any, name: str, width: int) -> NDArray[Any]:
+    """(width, rows) of a column of lists, null = NaN."""
+    import pyarrow.compute as pc
+
+    there = column.is_valid().to_numpy(zero_copy_only=False)
+    lists = column.drop_null()
+    lengths = pc.list_value_length(lists).to_numpy(zero_copy_only=False)
+    if (lengths != width).any():
+        raise FileFormatError(
+            f"column {name!r} holds lists of {width} values and of {lengths[lengths != width][0]}, "
+            "expected one length; choose the columns that are channels with channels="
+        )
+    spread = np.full((width, len(column)), np.nan)
+    spread[:, there] = _numbers(lists.flatten()).reshape(-1, width).T
+    return spread
+
+
+def _text(column: Any) -> Any:
+    import pyarrow as pa
+
+    if pa.types.is_dictionary(column.type):
+        column = column.dictionary_decode()
+    return column if pa.types.is_string(column.type) else column.cast(pa.string())
+
+
+def _without_nulls(column: Any, name: str, before: int) -> Any:
+    import pyarrow as pa
+
+    empty = column.is_null()
+    if pa.types.is_string(column.type):
+        import pyarrow.compute as pc
+
+        empty = pc.or_kleene(empty, pc.equal(column, ""))
+    flags = empty.fill_null(True).to_numpy(zero_copy_only=False)
+    if flags.any():
+        raise NullCellError(name, before + int(flags.argmax()))
+    return column
+
+
+def line_error(path: Path, error: Any) -> FileFormatError:
+    """What Arrow says of a file, in one line."""
+    return FileFormatError(f"{path}: {' '.join(str(error).split())}")

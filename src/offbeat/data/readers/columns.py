@@ -1,0 +1,314 @@
+"""Tables, whatever their file: which column is what, and from columns to recordings.
+
+A table is wide (a row per time, a column per channel) or long (a row per measured value: time,
+channel, value), and holds one recording or, by a column of labels, several.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.clock import TIME_NAMES, split_unit, time_column_of, to_nanoseconds
+from offbeat.data.recording import Recording, Signal
+from offbeat.errors import FileFormatError, one_of
+
+LABEL_NAMES = ("trajectory", "episode", "episode_index", "demo")
+"""Names, in any case, that make a column the label of the trajectory that a row belongs to."""
+
+KEY_NAMES = ("channel", "variable", "signal", "sensor", "name", "key", "topic", "field")
+VALUE_NAMES = ("value", "val", "data", "reading")
+"""Names, in any case, of the two columns beside the time that make a table a long one."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What each column of a table is.
+
+    Attributes:
+        time: the column of times.
+        label: the column of labels, or None.
+        channels: the columns that are channels; in a long table the one of values.
+        names: of the channels, without the unit that a column's name may say.
+        units: of the channels.
+        key: in a long table, the column that says which channel a value is of.
+        chosen: in a long table, the channels asked for, or None.
+    """
+
+    time: str
+    label: str | None
+    channels: tuple[str, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    key: str | None = None
+    chosen: tuple[str, ...] | None = None
+    stated: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        header: Sequence[str],
+        *,
+        time_column: str | None = None,
+        trajectory_column: str | None = None,
+        channels: Sequence[str] | None = None,
+        units: Mapping[str, str] | None = None,
+        channel_column: str | None = None,
+        value_column: str | None = None,
+    ) -> Columns:
+        """Says what each column is: as asked for, else by its name.
+
+        Raises:
+            FileFormatError: there is no time or no channel.
+            InputError: an option names a column that there is not.
+        """
+        names = list(header)
+        time = time_column_of(names) if time_column is None else _named(time_column, names, "time")
+        if time is None:
+            raise FileFormatError(
+                f"{path} has no column of times: its columns must have one of the names "
+                f"{', '.join(TIME_NAMES[:3])}, ... got {listed(names)}; say which one with "
+                "time_column="
+            )
+        others = [name for name in names if name != time]
+        folded = {name.casefold(): name for name in reversed(others)}
+        label = next((folded[name] for name in LABEL_NAMES if name in folded), None)
+        if trajectory_column is not None:
+            label = _named(trajectory_column, others, "trajectory")
+        rest = [name for name in others if name != label]
+        if not rest:
+            raise FileFormatError(
+                f"{path} has no channels, only the columns {listed(names)}; it needs one column "
+                "per channel beside the time"
+            )
+        key, value = _long_form(rest, channel_column, value_column)
+        if key is not None and value is not None:
+            chosen = None if channels is None else tuple(dict.fromkeys(channels))
+            return cls(
+                time, label, (value,), (value,), ("",), key, chosen, stated=dict(units or {})
+            )
+        return cls._wide(time, label, rest, channels, dict(units or {}))
+
+    @classmethod
+    def _wide(
+        cls,
+        time: str,
+        label: str | None,
+        columns: list[str],
+        channels: Sequence[str] | None,
+        stated: dict[str, str],
+    ) -> Columns:
+        split = [split_unit(column) for column in columns]
+        short = [name for name, _ in split]
+        if len(set(short)) < len(short):
+            short = columns
+        units = {n: unit for n, c, (_, unit) in zip(short, columns, split, strict=True) if n != c}
+        column_of = dict(zip(columns, columns, strict=True)) | dict(
+            zip(short, columns, strict=True)
+        )
+        name_of = dict(zip(columns, short, strict=True))
+        names = short
+        if channels is not None:
+            asked = dict.fromkeys(
+                column_of[name if name in column_of else one_of("channel", name, short)]
+                for name in channels
+            )
+            columns, names = list(asked), [name_of[column] for column in asked]
+        for name in stated:
+            one_of("channel in units", name, names)
+        return cls(
+            time,
+            label,
+            tuple(columns),
+            tuple(names),
+            tuple(stated.get(name, units.get(name, "")) for name in names),
+        )
+
+    @property
+    def read(self) -> list[str]:
+        """The columns that are needed, each once."""
+        wanted = [self.time, self.label, self.key, *self.channels]
+        return list(dict.fromkeys(name for name in wanted if name is not None))
+
+
+def _named(name: str, columns: list[str], what: str) -> str:
+    """A column by its name, with or without the unit that it says."""
+    if name in columns:
+        return name
+    short = {split_unit(column)[0]: column for column in reversed(columns)}
+    return short[name] if name in short else one_of(f"{what}_column", name, columns)
+
+
+def _long_form(
+    rest: list[str], channel_column: str | None, value_column: str | None
+) -> tuple[str | None, str | None]:
+    folded = {name.casefold(): name for name in reversed(rest)}
+    keys = [folded[name] for name in KEY_NAMES if name in folded]
+    values = [folded[name] for name in VALUE_NAMES if name in folded]
+    if channel_column is None and value_column is None:
+        if len(rest) == 2 and len(keys) == len(values) == 1:
+            return keys[0], values[0]
+        return None, None
+    key = (
+        _named(channel_column, rest, "channel")
+        if channel_column is not None
+        else next(iter(keys), None)
+    )
+    left = [name for name in rest if name != key]
+    value = (
+        _named(value_column, left, "value")
+        if value_column is not None
+        else next((name for name in values if name != key), None)
+    )
+    if key is None:
+        key = one_of("channel_column", "", rest)
+    if value is None:
+        value = one_of("value_column", "", left)
+    return key, value
+
+
+@dataclass(frozen=True, eq=False)
+class Coded:
+    """A column of texts: a number per row, and the texts that the numbers stand for."""
+
+    codes: NDArray[np.int64]
+    texts: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """The columns of a table that are needed.
+
+    Attributes:
+        clock: (rows,) integers or floats.
+        labels: which recording each row belongs to, or None.
+        keys: in a long table, which channel each row is of, or None.
+        values: (rows, channels), column after column in memory.
+    """
+
+    clock: NDArray[Any]
+    labels: Coded | None
+    keys: Coded | None
+    values: NDArray[np.float64]
+
+
+class Coder:
+    """Numbers the texts of a column that comes in chunks, in the order of their first rows."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, int] = {}
+        self._codes: list[NDArray[np.int64]] = []
+
+    def add(self, column: Any) -> None:
+        """Adds an Arrow array of strings without nulls."""
+        coded = column.dictionary_encode()
+        texts = coded.dictionary.to_pylist()
+        codes = np.array(
+            [self._of.setdefault(text, len(self._of)) for text in texts], dtype=np.int64
+        )
+        self._codes.append(codes[coded.indices.to_numpy(zero_copy_only=False)])
+
+    def add_texts(self, texts: Sequence[str]) -> None:
+        """Adds texts, one per row."""
+        codes = [self._of.setdefault(text, len(self._of)) for text in texts]
+        self._codes.append(np.array(codes, dtype=np.int64))
+
+    def done(self) -> Coded:
+        """All rows."""
+        return Coded(np.concatenate([*self._codes, np.zeros(0, np.int64)]), list(self._of))
+
+
+def recordings(
+    path: Path,
+    columns: Columns,
+    unit: str,
+    notes: Sequence[str],
+    table: Gathered,
+    *,
+    shown: str = "",
+) -> list[Recording]:
+    """One recording per label, or one in all, from the columns of a table.
+
+    Args:
+        path: for messages.
+        columns: what they are.
+        unit: of the clock.
+        notes: to be said aloud.
+        table: the columns.
+        shown: the unit that the file counts in, where the clock is in another one already.
+
+    Raises:
+        FileFormatError: a time is not finite, or a channel that is asked for is in no row.
+    """
+    try:
+        stamps, zero = to_nanoseconds(table.clock, unit)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from None
+    made = []
+    for text, rows in _groups(table.labels):
+        origin = f"{path.name}, {columns.label} {text}" if columns.label else path.name
+        values = table.values[rows]
+        if table.keys is None:
+            signals = [Signal("", stamps[rows], values, columns.names, columns.units)]
+        else:
+            keys = Coded(table.keys.codes[rows], table.keys.texts)
+            signals = _by_key(path, columns, keys, stamps[rows], values)
+        made.append(
+            Recording(tuple(signals), text, origin, shown or unit, tuple(notes), clock_zero=zero)
+        )
+    return made
+
+
+def _by_key(
+    path: Path,
+    columns: Columns,
+    keys: Coded,
+    stamps: NDArray[np.int64],
+    values: NDArray[np.float64],
+) -> list[Signal]:
+    chosen = list(columns.chosen if columns.chosen is not None else keys.texts)
+    for name in [*chosen, *columns.stated]:
+        one_of("channel", name, keys.texts)
+    rows_of = dict(_groups(keys))
+    nothing = np.zeros(0, dtype=np.int64)
+    return [
+        Signal(
+            "",
+            stamps[rows_of.get(name, nothing)],
+            values[rows_of.get(name, nothing)],
+            (name,),
+            (columns.stated.get(name, ""),),
+        )
+        for name in chosen
+    ]
+
+
+def _groups(coded: Coded | None) -> list[tuple[str, Any]]:
+    """Texts in the order of their first rows, each with its rows, as a slice where they can be."""
+    if coded is None:
+        return [("", slice(None))]
+    codes = coded.codes
+    starts = np.flatnonzero(np.diff(codes, prepend=-1))
+    met = codes[starts]
+    if len(np.unique(met)) == len(met):  # one stretch each: nothing needs to be copied
+        ends = [*starts[1:], len(codes)]
+        return [
+            (coded.texts[code], slice(start, end))
+            for code, start, end in zip(met, starts, ends, strict=True)
+        ]
+    order = np.argsort(codes, kind="stable")
+    cuts = np.flatnonzero(np.diff(codes[order])) + 1
+    groups = np.split(order, cuts)
+    groups.sort(key=lambda rows: int(rows[0]))
+    return [(coded.texts[codes[rows[0]]], rows) for rows in groups]
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in quotes, for messages."""
+    return ", ".join(map(repr, names))

@@ -1,0 +1,335 @@
+"""HDF5 of robomimic and of Minari, through `h5py`: a recording per episode.
+
+robomimic (robomimic.github.io, "Dataset structure"): `data/demo_0/obs/<name>` and
+`data/demo_0/actions`, the environment as JSON in the attribute `env_args` of `data`, named subsets
+under `mask`. Minari (minari.farama.org, "Dataset standards"): `episode_0/observations`, one row
+longer than `episode_0/actions`, nested where the space is a dictionary or a tuple; the environment
+as JSON in `metadata.json` beside the file, or in an attribute of it. Neither stores times.
+
+Only arrays of numbers are read: what would need unpickling is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.clock import state_time_unit, time_column_of, to_nanoseconds
+from offbeat.data.signals import Recording, Signal
+from offbeat.data.source import require_file
+from offbeat.errors import FileFormatError, InputError, one_of, require
+
+SUFFIXES = (".hdf5", ".h5", ".hdf")
+
+WIDEST = 1024
+"""Numbers per row from which on an array is taken for a picture or a map, and left out."""
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_EPISODE = re.compile(r"(?:demo|episode)_(\d+)")
+_MAIN = ("data/main_data.hdf5", "main_data.hdf5")
+
+
+def recognises(path: Path) -> bool:
+    """Whether a file starts like HDF5, or a folder is a data set of Minari."""
+    if path.is_dir():
+        return any((path / name).is_file() for name in _MAIN)
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
+
+
+def recordings(
+    path: str | Path,
+    *,
+    keys: Sequence[str] | None = None,
+    actions: bool = True,
+    mask: str | None = None,
+    rate_hz: float | None = None,
+    time_unit: str | None = None,
+) -> Iterator[Recording]:
+    """Reads HDF5 of robomimic or Minari: a recording per episode, in the order of their numbers.
+
+    Args:
+        path: the file, or the folder of a Minari data set.
+        keys: the observations to read, such as `robot0_eef_pos`, or `achieved_goal` in Minari; by
+            default all that are numbers, but for pictures.
+        actions: whether the actions are read, too.
+        mask: robomimic's name of a subset of the episodes, such as `train`.
+        rate_hz: rows per second. By default that of the environment where the file says it; else
+            rows are taken to be 1 s apart, and that is said aloud.
+        time_unit: unit of an observation that is the time, where there is one.
+
+    Yields:
+        Recordings; an observation `<name>_quat` of four numbers is a quaternion.
+
+    Raises:
+        FileFormatError: the file is truncated, damaged, of another layout, or holds pickled
+            objects where numbers are expected.
+        InputError: a key or a mask is unknown, or the rate is not above 0.
+        MissingExtraError: `h5py` is not installed.
+    """
+    require("h5py", "hdf5")
+    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
+        raise InputError(f"rate_hz must be rows per second, above 0, got {rate_hz}")
+    path = Path(path)
+    if path.is_dir():
+        inside = [path / name for name in _MAIN if (path / name).is_file()]
+        if not inside:
+            raise FileFormatError(f"{path} holds no {_MAIN[0]}, expected a data set of Minari")
+        path = inside[0]
+    path = require_file(path)
+    with _opened(path) as file:
+        robomimic = "data" in file and any(map(_EPISODE.fullmatch, file["data"]))
+        root = file["data"] if robomimic else file
+        names = sorted(
+            (name for name in root if _EPISODE.fullmatch(name)),
+            key=lambda name: int(name.rpartition("_")[2]),
+        )
+        if not names:
+            raise FileFormatError(
+                f"{path} is laid out neither like robomimic (data/demo_0/obs) nor like Minari "
+                f"(episode_0/observations); it holds: {', '.join(sorted(file)) or 'nothing'}"
+            )
+        if mask is not None:
+            names = _masked(file, mask, names, path)
+        rate, notes = _rate(root, path, rate_hz, robomimic=robomimic)
+        for name in names:
+            observations = _observations(root[name], path, robomimic=robomimic)
+            yield _episode(
+                root[name], observations, path, notes,
+                keys=keys, actions=actions, rate=rate, time_unit=time_unit,
+            )  # fmt: skip
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The file, with whatever HDF5 raises over damage turned into one line."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError) as error:
+        what = " ".join(str(error).split())
+        raise FileFormatError(
+            f"{path} can't be read as HDF5, it is truncated, damaged or of another format "
+            f"({what}); copy it again"
+        ) from None
+
+
+def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:
+    masks = list(file["mask"]) if "mask" in file else []
+    if not masks:
+        raise InputError(f"{path} has no masks, leave mask out")
+    listed = file["mask"][one_of(f"mask of {path.name}", mask, masks)]
+    if listed.dtype.kind not in "SO":
+        raise FileFormatError(f"{path}: the mask {mask!r} holds {listed.dtype}, expected names")
+    chosen = {text.decode() if isinstance(text, bytes) else str(text) for text in listed[()]}
+    return [name for name in names if name in chosen]
+
+
+def _rate(
+    root: Any, path: Path, given: float | None, *, robomimic: bool
+) -> tuple[float, tuple[str, ...]]:
+    """Rows per second, and what is to be said about it."""
+    if given is not None:
+        return given, (f"stamps are row number / {given:g} Hz, as rate_hz says",)
+    said = "robomimic" if robomimic else "Minari"
+    found = _control_hz(root) if robomimic else None
+    if found is not None:
+        return found, (
+            f"stamps are row number / {found:g} Hz, the environment's control_freq; {said} stores "
+            "no times",
+        )
+    return 1.0, (
+        f"rows are taken to be 1 s apart: {said} stores no times, and no rate stands in "
+        f"{path.name}; state it with rate_hz",
+    )
+
+
+def _control_hz(root: Any) -> float | None:
+    try:
+        rate = json.loads(root.attrs["env_args"])["env_kwargs"]["control_freq"]
+    except (KeyError, TypeError, ValueError):
+        return None
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else None
+
+
+def _observations(episode: Any, path: Path, *, robomimic: bool) -> Any:
+    inside = "obs" if robomimic else "observations"
+    if inside not in episode:
+        why = (
+            "extract them from its states with robomimic's dataset_states_to_obs.py"
+            if robomimic
+            else "write it with Minari again"
+        )
+        raise FileFormatError(f"{path}: {episode.name} has no {inside}; {why}")
+    return episode[inside]
+
+
+def _episode(
+    episode: Any,
+    observations: Any,
+    path: Path,
+    notes: tuple[str, ...],
+    *,
+    keys: Sequence[str] | None,
+    actions: bool,
+    rate: float,
+    time_unit: str | None,
+) -> Recording:
+    leaves = dict(_leaves(observations, ""))
+    if keys is not None:
+        known = {name for leaf in leaves for name in _prefixes(leaf)}
+        for key in keys:
+            one_of(f"key of {path.name}", key, known)
+    left: list[str] = []
+    arrays: dict[str, NDArray[np.float64]] = {}
+    clock: tuple[str, NDArray[Any]] | None = None
+    for name, dataset in leaves.items():
+        chosen = keys is not None and any(key in keys for key in _prefixes(name))
+        if keys is not None and not chosen:
+            continue
+        _refuse_objects(dataset, path)
+        width = int(np.prod(dataset.shape[1:]))
+        if dataset.dtype.kind not in "biuf" or not dataset.ndim:
+            left.append(f"{name} ({_what(dataset)})")
+        elif not chosen and (width > WIDEST or dataset.ndim > 3):
+            left.append(f"{name} ({' x '.join(map(str, dataset.shape[1:]))})")
+        elif width == 1 and time_column_of([name]):
+            clock = name, dataset[()].reshape(-1)
+        elif width:
+            arrays[name] = np.asarray(dataset[()], dtype=np.float64).reshape(len(dataset), width)
+    if not arrays:
+        raise FileFormatError(
+            f"{path}: {episode.name} holds no observations that are numbers; it has: "
+            f"{', '.join(leaves) or 'none'}"
+        )
+    rows = {name: len(values) for name, values in arrays.items()}
+    if len(set(rows.values())) > 1 or (clock and len(clock[1]) not in rows.values()):
+        raise FileFormatError(
+            f"{path}: observations of {episode.name} differ in their rows: "
+            + ", ".join(f"{name} {n}" for name, n in rows.items())
+        )
+    n = next(iter(rows.values()))
+    if clock:
+        unit, said = state_time_unit(time_unit, clock[0], clock[1], str(path))
+        stamps, zero = to_nanoseconds(clock[1], unit)
+        notes = (f"stamps are the observation {clock[0]!r}", *said)
+    else:
+        unit, zero = "s", 0
+        stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
+    if left:
+        notes = (*notes, f"left out: {', '.join(left)}")
+    names = {name: _names(name, values.shape[1]) for name, values in arrays.items()}
+    signal = Signal(
+        "",
+        stamps,
+        np.hstack(list(arrays.values())),
+        tuple(channel for channels in names.values() for channel in channels),
+        kinds=tuple(kind for name, channels in names.items() for kind in _kinds(name, channels)),
+    )
+    acted = None
+    if actions:
+        acted, more = _actions(episode, path, stamps)
+        notes = (*notes, *more)
+    label = episode.name.rpartition("/")[2]
+    return Recording(
+        (signal,),
+        label=label,
+        origin=f"{path.name}, {label}",
+        time_unit=unit,
+        notes=notes,
+        clock_zero=zero,
+        actions=acted,
+    )
+
+
+def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """The arrays below a group, by path; of an array, itself. Elements of a tuple are numbered."""
+    import h5py
+
+    if isinstance(node, h5py.Dataset):
+        yield path, node
+        return
+    for name in node:
+        here = name.removeprefix("_index_")
+        yield from _leaves(node[name], f"{path}/{here}" if path else here)
+
+
+def _prefixes(path: str) -> Iterator[str]:
+    parts = path.split("/")
+    for i in range(len(parts)):
+        yield "/".join(parts[: i + 1])
+
+
+def _refuse_objects(dataset: Any, path: Path) -> None:
+    """Raises for what would have to be unpickled: opaque bytes, and objects of PyTables."""
+    kind = dataset.dtype
+    if (kind.kind == "V" and kind.names is None) or "PSEUDOATOM" in dataset.attrs:
+        raise FileFormatError(
+            f"{path}: {dataset.name} holds objects ({kind}), which would have to be unpickled, and "
+            "that can run any code; Offbeat never does; write numbers, or choose others with keys="
+        )
+
+
+def _what(dataset: Any) -> str:
+    """In a word, what an array holds that is none of numbers."""
+    import h5py
+
+    if dataset.dtype.kind in "SU" or h5py.check_string_dtype(dataset.dtype) is not None:
+        return "text"
+    if dataset.dtype.names is not None:
+        return "records"
+    if h5py.check_vlen_dtype(dataset.dtype) is not None:
+        return "lists"
+    return str(dataset.dtype) if dataset.ndim else "one number"
+
+
+def _names(name: str, width: int) -> list[str]:
+    if not name:  # all observations are one array
+        return [f"observation[{i}]" for i in range(width)]
+    return [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
+
+
+def _kinds(name: str, channels: list[str]) -> list[str]:
+    whole = len(channels) == 4 and name.endswith(("_quat", "/quat", "_quaternion"))
+    return ["quaternion" if whole else ""] * len(channels)
+
+
+def _actions(
+    episode: Any, path: Path, stamps: NDArray[np.int64]
+) -> tuple[Signal | None, tuple[str, ...]]:
+    """The actions, one per row of the observations; of a space of many, side by side."""
+    if "actions" not in episode:
+        return None, ("there are no actions",)
+    parts, names = [], []
+    for name, dataset in _leaves(episode["actions"], ""):
+        _refuse_objects(dataset, path)
+        if dataset.dtype.kind not in "biuf" or not dataset.ndim:
+            return None, (f"actions are left out, they hold {_what(dataset)}",)
+        values = np.asarray(dataset[()], dtype=np.float64)
+        parts.append(values.reshape(len(values), -1))
+        start = f"action.{name}" if name else "action"
+        names += [f"{start}[{i}]" for i in range(parts[-1].shape[1])]
+    n = len(stamps)
+    if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (n, n - 1):
+        raise FileFormatError(
+            f"{path}: {episode.name} has {[len(part) for part in parts]} actions for {n} "
+            "observations, expected as many or one less; read it without, with actions=False"
+        )
+    values = np.hstack(parts)
+    notes: tuple[str, ...] = ()
+    if len(values) == n - 1 and len(values):
+        values = np.vstack([values, values[-1:]])
+        notes = ("the last observation has no action of its own; the one before stands there",)
+    return Signal("action", stamps, values, tuple(names)), notes

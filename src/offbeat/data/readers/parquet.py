@@ -1,0 +1,189 @@
+"""Parquet that other programs wrote: tables of pandas, Polars, Spark, DuckDB, ..."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from offbeat.data.clock import state_time_unit, time_column_of
+from offbeat.data.readers.batches import NullCellError, gather, line_error
+from offbeat.data.readers.columns import Columns, listed, recordings
+from offbeat.data.recording import Recording
+from offbeat.data.source import require_file
+from offbeat.errors import FileFormatError
+
+_ROWS = 1 << 16  # in memory at a time, beside the result
+_BUFFER = 1 << 18  # bytes of each column in memory at a time
+_INDEX = "__index_level_0__"  # what pandas calls an index without a name
+
+
+def read_parquet(
+    path: str | Path,
+    *,
+    time_column: str | None = None,
+    trajectory_column: str | None = None,
+    channels: Sequence[str] | None = None,
+    time_unit: str | None = None,
+    units: Mapping[str, str] | None = None,
+    channel_column: str | None = None,
+    value_column: str | None = None,
+) -> list[Recording]:
+    """Reads recordings from Parquet: a row per time, or one per measured value.
+
+    Columns are taken as in CSV. A column of time stamps or durations knows its unit. A column of
+    lists of one length gives a channel per place, `name.0`, `name.1`, ... The file is read 65,536
+    rows at a time.
+
+    Args:
+        path: the file.
+        time_column: the column of times; by default found by its name, see `TIME_NAMES`, or the
+            index of pandas where it holds time stamps.
+        trajectory_column: the column that says to which trajectory a row belongs; by default found
+            by its name, see `LABEL_NAMES`.
+        channels: the columns to read as channels, in the order wanted; by default all.
+        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's type or name says,
+            else found by the numbers, which is said aloud, else `s`.
+        units: unit of a channel by its name.
+        channel_column: the column that says which channel a value is of, in the long form.
+        value_column: the column of values, in the long form.
+
+    Returns:
+        A recording per trajectory, in the order of their first rows; null is NaN.
+
+    Raises:
+        FileFormatError: the file is missing, empty, truncated, no Parquet, has no time, or a
+            channel that is no number.
+        InputError: an option names a column or a unit that there is not.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path = require_file(path)
+    try:
+        # Else a whole row group, which can be all of the file, would lie in memory, too.
+        with pq.ParquetFile(path, pre_buffer=False, buffer_size=_BUFFER) as file:
+            schema = file.schema_arrow
+            columns = Columns.of(
+                path,
+                _names(schema, time_column),
+                time_column=time_column or _index_of_times(schema),
+                trajectory_column=trajectory_column,
+                channels=channels,
+                units=units,
+                channel_column=channel_column,
+                value_column=value_column,
+            )
+            _check_types(path, schema, columns)
+            if not file.metadata.num_rows:
+                raise FileFormatError(f"{path} has columns and no rows, expected one per time")
+            batches = file.iter_batches(_ROWS, columns=columns.read)
+            first = next(batches)
+            widths = {
+                name: _width(path, name, first.column(name))
+                for name in columns.channels
+                if _is_list(schema.field(name).type)
+            }
+            notes: tuple[str, ...] = ()
+            kind = schema.field(columns.time).type
+            if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+                unit = str(kind.unit)
+            else:
+                sample = first.column(columns.time).drop_null()
+                sample = sample.cast(pa.float64(), safe=False).to_numpy()
+                unit, notes = state_time_unit(time_unit, columns.time, sample, str(path))
+            table = gather(
+                itertools.chain([first], batches),
+                columns,
+                file.metadata.num_rows,
+                widths=widths,
+            )
+    except NullCellError as error:
+        raise FileFormatError(
+            f"{path} has an empty cell in row {error.row}, column {error.column!r}, where every "
+            "row needs a value; drop that row"
+        ) from None
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        said = line_error(path, error)
+        raise FileFormatError(
+            f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
+            f"({str(said).removeprefix(f'{path}: ')}); copy it again"
+        ) from None
+    return recordings(path, _spread(columns, widths), unit, notes, table)
+
+
+def _names(schema: Any, time_column: str | None) -> list[str]:
+    """The columns, without the index that pandas stored, unless it is the time."""
+    wanted = time_column or _index_of_times(schema)
+    return [name for name in schema.names if name != _INDEX or name == wanted]
+
+
+def _index_of_times(schema: Any) -> str | None:
+    import pyarrow as pa
+
+    if _INDEX not in schema.names or time_column_of(list(schema.names)) is not None:
+        return None
+    kind = schema.field(_INDEX).type
+    return _INDEX if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) else None
+
+
+def _check_types(path: Path, schema: Any, columns: Columns) -> None:
+    import pyarrow as pa
+
+    kind = schema.field(columns.time).type
+    times = (pa.types.is_timestamp, pa.types.is_duration, pa.types.is_integer, pa.types.is_floating)
+    if not any(fits(kind) for fits in times):
+        raise FileFormatError(
+            f"{path} has {kind} in column {columns.time!r}, expected times: numbers, time stamps "
+            "or durations; say which column is the time with time_column="
+        )
+    for name in columns.channels:
+        kind = schema.field(name).type
+        inner = kind.value_type if _is_list(kind) else kind
+        numbers = (
+            pa.types.is_integer,
+            pa.types.is_floating,
+            pa.types.is_boolean,
+            pa.types.is_decimal,
+            pa.types.is_null,
+        )
+        if not any(fits(inner) for fits in numbers):
+            raise FileFormatError(
+                f"{path} has {kind} in column {name!r}, expected numbers; choose the columns that "
+                f"are channels with channels=, of: {listed(columns.channels)}"
+            )
+
+
+def _is_list(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return bool(
+        pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
+    )
+
+
+def _width(path: Path, name: str, column: Any) -> int:
+    import pyarrow.compute as pc
+
+    lengths = pc.unique(pc.list_value_length(column.drop_null())).to_pylist()
+    if len(lengths) != 1:
+        raise FileFormatError(
+            f"{path} has lists of {len(lengths)} lengths in column {name!r}, expected one length; "
+            "choose the columns that are channels with channels="
+        )
+    return int(lengths[0])
+
+
+def _spread(columns: Columns, widths: Mapping[str, int]) -> Columns:
+    """A name and a unit per channel, where a column has several."""
+    if not widths:
+        return columns
+    names: list[str] = []
+    units: list[str] = []
+    for column, name, unit in zip(columns.channels, columns.names, columns.units, strict=True):
+        own = [f"{name}.{i}" for i in range(widths[column])] if column in widths else [name]
+        names += own
+        units += [unit] * len(own)
+    return replace(columns, names=tuple(names), units=tuple(units))

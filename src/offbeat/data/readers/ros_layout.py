@@ -1,0 +1,371 @@
+"""Where the numbers stand in a serialised ROS message, and how thousands are decoded at once.
+
+Messages of one topic mostly have one layout: the same length, the same lengths of strings and
+sequences. So a layout is found once, by walking along one message, and all messages that agree with
+it in these lengths are decoded together, as columns of one table of bytes. Nothing is done per
+message in Python, and what is not asked for is never decoded.
+
+The layouts: ROS 1 writes fields one after the other, little endian, strings and sequences after
+their length (wiki.ros.org/msg). ROS 2 writes CDR (OMG formal/02-06-51, 9.3): four bytes that say
+the byte order, then the same with every number at a multiple of its size, and strings with their
+end byte counted.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.errors import FileFormatError
+
+Definitions = Mapping[str, tuple[Any, Any]]
+"""Fields of each message type, as `rosbags` parses them: name and description of every field."""
+
+WIDEST = 64
+"""Longest sequence whose elements become channels without being asked for."""
+
+_BASE, _NAME, _ARRAY = 1, 2, 3  # node types of a field's description; 4 is a sequence
+_CODES = {
+    "bool": "u1",
+    "byte": "u1",
+    "char": "u1",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+}
+_TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+_HEADER = "std_msgs/msg/Header"
+_TRANSFORM = "geometry_msgs/msg/TransformStamped"
+_QUATERNION = "geometry_msgs/msg/Quaternion"
+_NAMES = ("name", "names", "joint_names")
+
+# Units that the definitions of the messages themselves, or REP 103, state.
+_UNITS = {
+    "geometry_msgs/msg/Pose": {"position": "m"},
+    "geometry_msgs/msg/PointStamped": {"point": "m"},
+    "geometry_msgs/msg/Transform": {"translation": "m"},
+    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
+    "geometry_msgs/msg/Accel": {"linear": "m/s^2", "angular": "rad/s^2"},
+    "geometry_msgs/msg/Wrench": {"force": "N", "torque": "N m"},
+    "geometry_msgs/msg/Pose2D": {"x": "m", "y": "m", "theta": "rad"},
+    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s^2"},
+    "sensor_msgs/msg/MagneticField": {"magnetic_field": "T"},
+    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa"},
+    "sensor_msgs/msg/Temperature": {"temperature": "degC"},
+    "sensor_msgs/msg/Range": {"range": "m", "min_range": "m", "max_range": "m"},
+    "sensor_msgs/msg/NavSatFix": {"latitude": "deg", "longitude": "deg", "altitude": "m"},
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number of a message: a channel.
+
+    Args:
+        name: path of its field, such as `pose.position.x` or `effort[2]`.
+        offset: its place in the message, in bytes.
+        code: its type as NumPy writes it, such as `<f8`.
+        unit: unit, where the definition of the message states one.
+        kind: `angle`, `quaternion` or empty.
+    """
+
+    name: str
+    offset: int
+    code: str
+    unit: str = ""
+    kind: str = ""
+
+
+@dataclass
+class Row:
+    """What one message says at one time: a row of one signal.
+
+    Args:
+        suffix: what the signal's name has beside the topic's: the child frame of a transform.
+        columns: the channels.
+        stamp: places of seconds and nanoseconds of the header's stamp; None without a header.
+    """
+
+    suffix: str = ""
+    columns: list[Column] = field(default_factory=list)
+    stamp: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything stands in messages of one length that agree in some of their bytes.
+
+    Args:
+        places: (bytes,) the places of these bytes.
+        expected: (bytes,) what stands there.
+        order: byte order, `<` or `>`.
+        rows: what is taken from a message; several rows from a list of transforms.
+        skipped: fields that are left out, each with the reason.
+        available: fields that could be taken.
+    """
+
+    places: NDArray[np.intp]
+    expected: NDArray[np.uint8]
+    order: str
+    rows: tuple[Row, ...]
+    skipped: Mapping[str, str]
+    available: tuple[str, ...]
+
+    def fits(self, table: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """(messages,) whether each message, a row of bytes, has this layout."""
+        return np.asarray((table[:, self.places] == self.expected).all(axis=1))
+
+    def stamps(self, table: NDArray[np.uint8], row: Row) -> NDArray[np.int64] | None:
+        """(messages,) header stamps in nanoseconds, or None without a header."""
+        if row.stamp is None:
+            return None
+        seconds: NDArray[np.int64]
+        seconds = _numbers(table, row.stamp[0], self.order + "i4", 1)[:, 0].astype(np.int64)
+        nanoseconds = _numbers(table, row.stamp[1], self.order + "u4", 1)[:, 0].astype(np.int64)
+        stamps: NDArray[np.int64] = seconds * 1_000_000_000 + nanoseconds
+        return stamps
+
+    def values(self, table: NDArray[np.uint8], row: Row) -> NDArray[np.float64]:
+        """(messages, channels) the numbers, as float64."""
+        values = np.empty((len(table), len(row.columns)))
+        first = 0
+        while first < len(row.columns):  # numbers that stand side by side are taken together
+            start = row.columns[first]
+            size = int(start.code[-1])
+            last = first + 1
+            while (
+                last < len(row.columns)
+                and row.columns[last].code == start.code
+                and row.columns[last].offset == start.offset + (last - first) * size
+            ):
+                last += 1
+            values[:, first:last] = _numbers(table, start.offset, start.code, last - first)
+            first = last
+        return values
+
+
+def _numbers(table: NDArray[np.uint8], offset: int, code: str, count: int) -> NDArray[Any]:
+    size = int(code[-1]) * count
+    return np.ascontiguousarray(table[:, offset : offset + size]).view(code)
+
+
+def find_layout(
+    message: bytes,
+    kind: str,
+    definitions: Definitions,
+    *,
+    cdr: bool,
+    wanted: Callable[[str], bool] | None = None,
+) -> Layout:
+    """Walks along one message and notes where everything stands.
+
+    Args:
+        message: the message as it was serialised.
+        kind: its type, such as `sensor_msgs/msg/Imu`.
+        definitions: fields of this type and of those that it holds.
+        cdr: serialised by ROS 2; else by ROS 1.
+        wanted: whether a channel of this name is asked for. By default all numbers are, but for
+            covariances, sequences longer than `WIDEST`, times, and what the header holds.
+
+    Raises:
+        FileFormatError: the message does not fit the definition, or a type is not known.
+    """
+    walk = _Walk(message, definitions, cdr=cdr, wanted=wanted)
+    try:
+        walk.message(kind, "", Row(), "")
+    except (struct.error, UnicodeDecodeError) as error:
+        raise FileFormatError(
+            f"a message of type {kind} is cut short or damaged ({error})"
+        ) from None
+    rest = len(message) - walk.base - walk.position
+    if rest < 0 or rest > (3 if cdr else 0):
+        raise FileFormatError(
+            f"a message of {len(message)} bytes does not fit the definition of {kind}, which "
+            f"takes {walk.base + walk.position}"
+        )
+    places = np.array(sorted(walk.agreed), dtype=np.intp)
+    return Layout(
+        places,
+        np.frombuffer(message, np.uint8)[places],
+        walk.order,
+        tuple(row for row in walk.rows if row.columns),
+        walk.skipped,
+        tuple(dict.fromkeys(walk.available)),
+    )
+
+
+class _Walk:
+    """A walk along one message; `position` counts from the start of its fields."""
+
+    def __init__(
+        self,
+        message: bytes,
+        definitions: Definitions,
+        *,
+        cdr: bool,
+        wanted: Callable[[str], bool] | None,
+    ) -> None:
+        self.raw = message
+        self.definitions = definitions
+        self.cdr = cdr
+        self.wanted = wanted
+        self.base = 4 if cdr else 0
+        self.order = "<"
+        self.position = 0
+        self.agreed: set[int] = set()
+        self.rows: list[Row] = []
+        self.skipped: dict[str, str] = {}
+        self.available: list[str] = []
+        if cdr:
+            if len(message) < 4 or message[0] != 0 or message[1] > 1:
+                raise FileFormatError(
+                    f"a message starts with {message[:4].hex(' ')}, expected the CDR of ROS 2 "
+                    "(00 00 or 00 01)"
+                )
+            self.order = "<" if message[1] else ">"
+            self.agreed.update((0, 1))
+
+    def message(self, kind: str, path: str, row: Row, unit: str) -> None:
+        """The fields of a message; a message that is no field itself is a row of its own."""
+        if kind not in self.definitions:
+            raise FileFormatError(f"the message type {kind} is not defined")
+        start = f"{path}." if path else ""
+        if not path:
+            self.rows.append(row)
+        units = _UNITS.get(kind, {})
+        labels: list[str] = []
+        sequences: list[tuple[str, int, str, int, str]] = []
+        first = len(row.columns)
+        for name, description in self.definitions[kind][1]:
+            node, what = description
+            here = start + name
+            unit_here = units.get(name, unit)
+            if node == _NAME:
+                if what in _TIMES:
+                    self._time(what, here, row, stamp=here in ("header.stamp", "stamp"))
+                else:
+                    self.message(what, here, row, unit_here)
+            elif node == _BASE and what[0] not in _CODES:
+                self._string(what[0])
+                if not here.startswith("header."):
+                    self.skipped.setdefault(here, "text")
+            elif node == _BASE:
+                offset, code = self._run(what[0], 1)
+                self._take(row, [here], offset, code, unit_here, here)
+            else:
+                (inner, detail), count = what
+                if node != _ARRAY:
+                    count = self._length()
+                if inner == _NAME:
+                    self._messages(detail, here, count)
+                elif detail[0] not in _CODES:
+                    texts = [self._string(detail[0], keep=name in _NAMES) for _ in range(count)]
+                    if name in _NAMES:
+                        labels = texts
+                    self.skipped.setdefault(here, "text")
+                elif count:
+                    offset, code = self._run(detail[0], count)
+                    sequences.append((here, offset, code, count, unit_here))
+        for here, offset, code, count, unit_here in sequences:
+            names = [f"{here}[{i}]" for i in range(count)]
+            if len(labels) == count and len(set(labels)) == count and all(labels):
+                names = [f"{here}.{label}" for label in labels]
+            self._take(row, names, offset, code, unit_here, here)
+        if kind == _QUATERNION and len(row.columns) - first == 4:
+            row.columns[first:] = [
+                Column(c.name, c.offset, c.code, "", "quaternion") for c in row.columns[first:]
+            ]
+
+    def _messages(self, kind: str, here: str, count: int) -> None:
+        """A list of messages: rows of their own where they are transforms, else left out."""
+        for _ in range(count):
+            mark, known = len(self.rows), len(self.available)
+            row = Row()
+            skipped, self.skipped = self.skipped, {}
+            self.message(kind, "", row, "")
+            self.skipped = skipped
+            if kind == _TRANSFORM:
+                row.suffix = self._child(row)
+            else:
+                del self.rows[mark:], self.available[known:]
+        if kind != _TRANSFORM:
+            self.skipped.setdefault(here, "a list of messages")
+
+    def _child(self, row: Row) -> str:
+        """The child frame of the transform that was just walked along; its bytes must agree."""
+        start, stop = self.last_text
+        self.agreed.update(range(start, stop))
+        return self.raw[start:stop].rstrip(b"\0").decode()
+
+    def _take(
+        self, row: Row, names: list[str], offset: int, code: str, unit: str, here: str
+    ) -> None:
+        self.available.append(here)
+        if self.wanted is None:
+            if here == "structure_needs_at_least_one_member" or here.startswith("header."):
+                return
+            if "covariance" in here.rpartition(".")[2]:
+                self.skipped.setdefault(here, f"covariance, {len(names)} numbers")
+                return
+            if len(names) > WIDEST:
+                self.skipped.setdefault(here, f"{len(names)} numbers, more than {WIDEST}")
+                return
+        size = int(code[-1])
+        angle = unit == "rad"
+        row.columns.extend(
+            Column(name, offset + i * size, code, unit, "angle" if angle else "")
+            for i, name in enumerate(names)
+            if self.wanted is None or self.wanted(name)
+        )
+
+    def _time(self, kind: str, here: str, row: Row, *, stamp: bool) -> None:
+        seconds, _ = self._run("int32", 1)
+        nanoseconds, _ = self._run("uint32", 1)
+        if stamp and kind == _TIMES[0]:
+            row.stamp = (seconds, nanoseconds)
+        else:
+            self.skipped.setdefault(here, "a time")
+
+    def _run(self, base: str, count: int) -> tuple[int, str]:
+        """Place and type of numbers that stand side by side."""
+        code = _CODES[base]
+        size = int(code[-1])
+        if self.cdr:
+            self.position += -self.position % size
+        offset = self.base + self.position
+        self.position += size * count
+        if offset + size * count > len(self.raw):
+            raise struct.error(f"{size * count} bytes expected at {offset} of {len(self.raw)}")
+        return offset, self.order + code
+
+    def _length(self) -> int:
+        offset, _ = self._run("uint32", 1)
+        self.agreed.update(range(offset, offset + 4))
+        (length,) = struct.unpack_from(self.order + "I", self.raw, offset)
+        if length > len(self.raw):
+            raise struct.error(f"a length of {length} at {offset} of {len(self.raw)}")
+        return int(length)
+
+    def _string(self, base: str, *, keep: bool = False) -> str:
+        if base != "string":
+            raise FileFormatError(f"fields of type {base} can't be read")
+        length = self._length()
+        start = self.base + self.position
+        self.position += length
+        self.last_text = (start, start + length)
+        if not keep:
+            return ""
+        self.agreed.update(range(start, start + length))
+        return self.raw[start : start + length].rstrip(b"\0").decode()

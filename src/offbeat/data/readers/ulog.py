@@ -1,0 +1,287 @@
+"""PX4 flight logs (ULog), through `pyulog`: every topic with its own stamps.
+
+The format: docs.px4.io, "ULog File Format". A log that was cut off, as by a loss of power, is read
+up to there, and the cut is said aloud; so are dropouts, which the autopilot logs itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Container, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.signals import Recording, Signal
+from offbeat.data.source import require_file
+from offbeat.errors import FileFormatError, one_of, require
+
+SUFFIXES = (".ulg", ".ulog")
+
+DEFAULTS = {
+    "sensor_combined": ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga", "baro_alt_meter"),
+    "vehicle_attitude": ("rollspeed", "pitchspeed", "yawspeed", "q"),
+    "vehicle_angular_velocity": ("xyz",),
+    "vehicle_local_position": ("x", "y", "z", "vx", "vy", "vz"),
+}
+"""Topics, and their fields, that are read where none are asked for: how the vehicle moves."""
+
+_MAGIC = b"ULog\x01\x12\x35"
+_LATEST_US = 2**53  # 285 years; a later stamp is damage
+
+# By the definitions of PX4's messages.
+_UNITS = {
+    "sensor_combined": {
+        "gyro_rad": "rad/s",
+        "accelerometer_m_s2": "m/s^2",
+        "magnetometer_ga": "G",
+        "baro_alt_meter": "m",
+    },
+    "sensor_gyro": dict.fromkeys("xyz", "rad/s"),
+    "sensor_accel": dict.fromkeys("xyz", "m/s^2"),
+    "vehicle_angular_velocity": {"xyz": "rad/s"},
+    "vehicle_acceleration": {"xyz": "m/s^2"},
+    "vehicle_attitude": dict.fromkeys(("rollspeed", "pitchspeed", "yawspeed"), "rad/s"),
+    "vehicle_local_position": {
+        **dict.fromkeys("xyz", "m"),
+        **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
+        **dict.fromkeys(("ax", "ay", "az"), "m/s^2"),
+        "heading": "rad",
+    },
+    "vehicle_attitude_setpoint": dict.fromkeys(("roll_body", "pitch_body", "yaw_body"), "rad"),
+    "vehicle_rates_setpoint": dict.fromkeys(("roll", "pitch", "yaw"), "rad/s"),
+}
+_QUATERNIONS = ("q", "q_d", "delta_q_reset", "q_offset")
+
+
+def recognises(path: Path) -> bool:
+    """Whether a file starts like a ULog."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
+
+
+def recordings(
+    path: str | Path,
+    *,
+    topics: Sequence[str] | None = None,
+    fields: Sequence[str] | None = None,
+) -> Iterator[Recording]:
+    """Reads a ULog: one recording, a signal per topic and instance.
+
+    Args:
+        path: the file.
+        topics: topics to read with all their instances (`sensor_accel`), or with one
+            (`sensor_accel:1`); by default those of `DEFAULTS`.
+        fields: fields to take, such as `q` (with all its elements) or `gyro_rad[0]`, or, of one
+            topic alone, `vehicle_attitude:q`; by default all numbers of the topics that were asked
+            for, except further stamps.
+
+    Yields:
+        The recording, with stamps of the autopilot's clock.
+
+    Raises:
+        FileFormatError: the file is no ULog, is cut off before any data, or holds none of the
+            topics.
+        InputError: a topic, instance or field is unknown.
+        MissingExtraError: `pyulog` is not installed.
+    """
+    require("pyulog", "px4")
+    path = require_file(path)
+    asked = dict(_instance(topic) for topic in topics) if topics is not None else None
+    wanted = _Wanted(DEFAULTS if asked is None else asked)
+    log, notes = _parsed(path, wanted)
+    there: dict[str, list[Any]] = {}
+    for data in sorted(log.data_list, key=lambda d: d.multi_id):
+        there.setdefault(data.name, []).append(data)
+    if asked is None:
+        chosen = {name: there[name] for name in DEFAULTS if name in there}
+        left = sorted(wanted.seen - chosen.keys())
+        if not chosen:
+            raise FileFormatError(
+                f"{path} holds none of the topics that are read by default "
+                f"({', '.join(DEFAULTS)}); choose with topics= from: {', '.join(left) or 'none'}"
+            )
+        if left:
+            more = f" and {len(left) - 8} more" if len(left) > 8 else ""
+            notes.append(f"left out unless chosen with topics=: {', '.join(left[:8])}{more}")
+    else:
+        chosen = {}
+        for name, instance in asked.items():
+            one_of(f"topic of {path.name}", name, wanted.seen)
+            chosen[name] = [d for d in there.get(name, []) if instance in (None, d.multi_id)]
+            if instance is not None and not chosen[name]:
+                one_of(f"instance of {name}", str(instance), _instances(there.get(name, [])))
+            if not chosen[name]:
+                raise FileFormatError(f"{path}: nothing was logged to topic {name}; leave it out")
+    pick = _Fields(fields, asked, chosen)
+    signals = [
+        signal
+        for name, instances in chosen.items()
+        for data in instances
+        if (signal := _signal(data, pick.of(name, data), notes)) is not None
+    ]
+    pick.check()
+    if not signals:
+        raise FileFormatError(
+            f"{path} holds no numbers in {', '.join(chosen)}; choose with topics="
+        )
+    yield Recording(tuple(signals), origin=path.name, time_unit="us", notes=tuple(notes))
+
+
+def _instance(topic: str) -> tuple[str, int | None]:
+    name, colon, number = topic.partition(":")
+    return name, int(number) if colon and number.isdecimal() else None
+
+
+def _instances(data: list[Any]) -> list[str]:
+    return [str(d.multi_id) for d in data]
+
+
+class _Wanted(Container[str]):
+    """The topics to read, as `pyulog` asks for them; remembers all that it asked for."""
+
+    def __init__(self, names: Container[str]) -> None:
+        self.names = names
+        self.seen: set[str] = set()
+
+    def __contains__(self, name: object) -> bool:
+        self.seen.add(str(name))
+        return name in self.names
+
+
+class _Watched(io.BufferedReader):
+    """A file that notes whether it ends in the middle of a message, which `pyulog` does not say."""
+
+    cut = False
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        # A log that is whole ends where the next header, of 3 bytes, would start.
+        if size is not None and len(data) < size and (data or size != 3):
+            self.cut = True
+        return data
+
+
+def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
+    """The log, and what is to be said about it."""
+    from pyulog import ULog
+
+    printed = io.StringIO()
+    file = _Watched(io.FileIO(path))
+    try:
+        with contextlib.redirect_stdout(printed):  # it prints what it finds damaged
+            log = ULog(file, wanted)
+    except Exception as error:
+        file.close()
+        what = " ".join(str(error).split()) or type(error).__name__
+        raise FileFormatError(
+            f"{path} can't be read as a ULog, it is truncated, damaged or of another format "
+            f"({what}); copy it from the vehicle again"
+        ) from None
+    if not wanted.seen:
+        raise FileFormatError(
+            f"{path} is cut off before any data, after {path.stat().st_size} bytes; copy it from "
+            "the vehicle again"
+        )
+    notes = []
+    if log.file_corruption:
+        said = printed.getvalue().splitlines()
+        why = f" ({said[0]})" if said else ""
+        notes.append(f"the file is damaged{why}; what could be made out is read")
+    elif file.cut:
+        seconds = (log.last_timestamp - log.start_timestamp) / 1e6
+        notes.append(
+            f"the file is cut off in the middle of a message, as by a loss of power; what stands "
+            f"before is read, {seconds:.3f} s"
+        )
+    if log.dropouts:
+        longest = max(log.dropouts, key=lambda d: d.duration)
+        notes.append(
+            f"the autopilot logged {len(log.dropouts)} dropouts, "
+            f"{sum(d.duration for d in log.dropouts)} ms in all, the longest of "
+            f"{longest.duration} ms at {(longest.timestamp - log.start_timestamp) / 1e6:.3f} s"
+        )
+    return log, notes
+
+
+class _Fields:
+    """Which fields of a topic are taken."""
+
+    def __init__(
+        self,
+        fields: Sequence[str] | None,
+        asked: dict[str, int | None] | None,
+        chosen: dict[str, list[Any]],
+    ) -> None:
+        self.asked = asked
+        self.patterns: list[tuple[str, str]] | None = None
+        self.met: set[tuple[str, str]] = set()
+        self.known: dict[str, None] = {}
+        if fields is None:
+            return
+        self.patterns = []
+        for text in fields:
+            topic, colon, name = text.rpartition(":")
+            if colon:
+                one_of(f"topic of field {text!r}", topic, chosen)
+            self.patterns.append((topic, name))
+
+    def of(self, topic: str, data: Any) -> list[str]:
+        """The names of the fields to take, in the order of the log."""
+        numbers = [f.field_name for f in data.field_data if f.type_str != "char"]
+        self.known.update(dict.fromkeys(name.partition("[")[0] for name in numbers))
+        if self.patterns is not None:
+            taken = []
+            for name in numbers:
+                met = [p for p in self.patterns if p[0] in ("", topic) and _below(name, p[1])]
+                self.met.update(met)
+                if met:
+                    taken.append(name)
+            return taken
+        if self.asked is None:
+            return [n for n in numbers if any(_below(n, field) for field in DEFAULTS[topic])]
+        return [n for n in numbers if "timestamp" not in n and "_padding" not in n]
+
+    def check(self) -> None:
+        """Raises `InputError` for a field that no topic has."""
+        for pattern in self.patterns or ():
+            if pattern not in self.met:
+                one_of("field", pattern[1], self.known)
+
+
+def _below(name: str, field: str) -> bool:
+    return name.startswith(field) and name[len(field) : len(field) + 1] in ("", "[", ".")
+
+
+def _signal(data: Any, names: list[str], notes: list[str]) -> Signal | None:
+    if not names:
+        return None
+    title = data.name if data.multi_id == 0 else f"{data.name}_{data.multi_id}"
+    clock: NDArray[np.uint64] = data.data["timestamp"]
+    good = clock <= _LATEST_US
+    if not good.all():
+        notes.append(f"{title}: {int((~good).sum())} rows with a damaged stamp are left out")
+    values = np.empty((int(good.sum()), len(names)), order="F")
+    for column, name in enumerate(names):
+        values[:, column] = data.data[name][good]
+    units = _UNITS.get(data.name, {})
+    bases = [name.partition("[")[0] for name in names]
+    kinds = []
+    for base in bases:
+        whole = base.rpartition(".")[2] in _QUATERNIONS and bases.count(base) == 4
+        angle = units.get(base) == "rad"
+        kinds.append("quaternion" if whole else "angle" if angle else "")
+    return Signal(
+        title,
+        clock[good].astype(np.int64) * 1000,
+        values,
+        tuple(names),
+        tuple(units.get(base, "") for base in bases),
+        tuple(kinds),
+    )

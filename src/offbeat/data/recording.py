@@ -1,0 +1,147 @@
+"""How recordings become a data set, whatever the format of their file.
+
+A reader says what stands in a file, as it was logged: a `Recording` per file or episode, with a
+`Signal` per sensor, topic or table. Whatever is to be decided about faults of clocks and sensors
+is decided here, once for all formats, by `Policies`; `assemble` applies them, counts what each did,
+and merges signals of different rates on the union of their stamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from offbeat.data import faults, mend
+from offbeat.data.clock import NANOSECONDS_PER
+from offbeat.data.merging import Channels, Episode, cut
+from offbeat.data.policies import Account
+from offbeat.data.policies import Policies as Policies
+from offbeat.data.signals import Recording as Recording
+from offbeat.data.signals import Signal as Signal
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import FileFormatError
+
+DEFAULT = Policies()
+"""The safe defaults."""
+
+
+def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> Dataset:
+    """Makes a data set of recordings: merges their signals and applies the policies.
+
+    In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
+    outages; held values, angles and quaternions per episode; resampling. Whether a channel is held
+    is found over all recordings together.
+
+    Memory: the arrays of a recording with one signal and no fault become those of its trajectory;
+    else there is, beside the result, one copy of the recordings at most.
+
+    Args:
+        recordings: at least one, with a row; all are read before anything is returned.
+        policies: what to do about faults.
+
+    Returns:
+        A trajectory per recording, or several where it was split. `meta` holds `time_unit`, the
+        `report` of what each policy did, `actions` (their names, where there are any), `labels`
+        (where recordings have them) and `clock_start`
+        (what the recording's clock showed at time 0, in `time_unit`, where that was not 0), each
+        with an entry per trajectory.
+
+    Raises:
+        FileFormatError: a policy refuses, or nothing is left.
+        InputError: `channels`, `without` or `angles` names a channel that there is not.
+    """
+    waiting: list[Recording | None] = list(recordings)
+    given = [recording for recording in waiting if recording is not None]
+    channels = Channels.of(given, policies)
+    unit = _common([recording.time_unit for recording in given], "ns")
+    actions = next((r.actions.channels for r in given if r.actions is not None), None)
+    labelled = any(recording.label for recording in given)
+    del given
+    account = Account(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
+    episodes: list[Episode] = []
+    for i, recording in enumerate(waiting):
+        assert recording is not None
+        waiting[i] = None  # its arrays go as soon as they are merged
+        account.notes |= dict.fromkeys(recording.notes)
+        episodes += cut(recording, channels, policies, account)
+    if not episodes:
+        raise FileFormatError(
+            "there is no row to read: every recording is empty, or was left out as too short "
+            f"(min_rows {policies.min_rows}); check the file, or give a smaller min_rows"
+        )
+    _mask_held(episodes, channels, policies, account)
+    if policies.unwrap or policies.quaternions == "continuous":
+        for episode in episodes:
+            _mend(episode, channels, policies, account)
+    if policies.resample_hz is not None:
+        for episode in episodes:
+            _resample(episode, policies.resample_hz)
+    trajectories = tuple(episode.trajectory(channels, policies) for episode in episodes)
+    meta: dict[str, Any] = {"time_unit": unit}
+    if labelled:
+        meta["labels"] = [episode.label for episode in episodes]
+    if actions is not None:
+        meta["actions"] = list(actions)
+    starts = [_clock(episode, unit) for episode in episodes]
+    if policies.start == "first_row" and any(starts):
+        meta["clock_start"] = starts
+    faulty = [{"episode": i, **e.faults} for i, e in enumerate(episodes) if e.faults]
+    return Dataset(trajectories, {**meta, "report": account.report(policies, faulty)})
+
+
+def _mask_held(
+    episodes: list[Episode], channels: Channels, policies: Policies, account: Account
+) -> None:
+    for c, name in enumerate(channels.names):
+        held = mend.find_held([episode.values[:, c] for episode in episodes])
+        if held is None:
+            continue
+        account.held[name] = {"share": held.share, "rows_per_value": held.rows_per_value}
+        if policies.held == "mask":
+            for episode in episodes:
+                column = episode.own()[:, c]
+                repeats = ~mend.measured_anew(column, held.rows_per_value) & ~np.isnan(column)
+                column[repeats] = np.nan
+                account.masked += int(repeats.sum())
+
+
+def _mend(episode: Episode, channels: Channels, policies: Policies, account: Account) -> None:
+    if policies.unwrap:
+        for c, period in channels.angles.items():
+            turns = mend.unwrap(episode.own()[:, c], period)
+            if turns:
+                account.turns[channels.names[c]] += turns
+    for four in channels.quaternions:
+        part = episode.own()[:, list(four)]
+        mended = mend.mend_quaternion(part)
+        episode.values[:, list(four)] = part
+        account.flipped += mended.flipped
+        account.renormalised += mended.renormalised
+        account.dropped += mended.dropped
+
+
+def _resample(episode: Episode, rate_hz: float) -> None:
+    """Rows at a fixed rate from the first stamp on, each with what was measured since the last."""
+    since = episode.stamps - episode.stamps[0]
+    rows = int(np.ceil(since[-1] * rate_hz / 1e9 - 1e-6)) + 1
+    grid = np.rint(np.arange(rows) * (1e9 / rate_hz)).astype(np.int64)
+    row = np.searchsorted(grid, since)  # the first row of the grid that is not before it
+    row = np.minimum(row, rows - 1)
+    starts = np.flatnonzero(np.diff(row, prepend=-1))
+    values = np.full((rows, episode.values.shape[1]), np.nan, order="F")
+    values[row[starts]] = faults.merge_rows(episode.values, starts, "last")
+    episode.stamps, episode.values, episode.owned = grid + episode.stamps[0], values, True
+
+
+def _clock(episode: Episode, unit: str) -> int | float:
+    """What the recording's clock showed at the first row, in `unit`."""
+    own = NANOSECONDS_PER[episode.recording.time_unit]
+    factor = NANOSECONDS_PER[unit]
+    nanoseconds = int(episode.stamps[0]) + episode.recording.clock_zero * own
+    return nanoseconds // factor if nanoseconds % factor == 0 else nanoseconds / factor
+
+
+def _common(values: list[str], otherwise: str) -> str:
+    return values[0] if len(set(values)) == 1 else otherwise

@@ -1,0 +1,111 @@
+"""What a reader hands over: a recording per file or episode, a signal per sensor, as logged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.clock import NANOSECONDS_PER
+from offbeat.errors import InputError, one_of
+
+KINDS = ("", "angle", "quaternion")
+"""What a channel can be, beyond a number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """What one sensor, topic or table said, as it was logged: faults are still inside.
+
+    Args:
+        name: of the topic or table. Channels are called `name.channel` where several signals are
+            merged, and `channel` where there is only one.
+        stamps: (n,) nanoseconds on the recording's clock, int64, in the order of the log.
+        values: (n, channels) float64, NaN = missing. A view of columns that lie one after the
+            other in memory (order F) is welcome: nothing is copied without need.
+        channels: a name per channel.
+        units: a unit per channel, such as `rad/s`; by default empty.
+        kinds: per channel `""`, `angle` (rad, or degrees where its unit is `deg`) or `quaternion`
+            (four channels in a row are one quaternion); by default `""`. A reader sets what it
+            knows.
+
+    Raises:
+        InputError: shapes, types or numbers of names disagree.
+    """
+
+    name: str
+    stamps: NDArray[np.int64]
+    values: NDArray[np.float64]
+    channels: tuple[str, ...]
+    units: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        where = f" of signal {self.name!r}" if self.name else ""
+        width = len(self.channels)
+        units = tuple(self.units) or ("",) * width
+        kinds = tuple(self.kinds) or ("",) * width
+        if self.stamps.dtype != np.int64 or self.stamps.ndim != 1:
+            raise InputError(
+                f"stamps{where} must be int64 nanoseconds of shape (n,), got {self.stamps.dtype} "
+                f"of shape {self.stamps.shape}"
+            )
+        if self.values.dtype != np.float64 or self.values.shape != (len(self.stamps), width):
+            raise InputError(
+                f"values{where} must be float64 of shape {(len(self.stamps), width)}, a row per "
+                f"stamp and a column per channel, got {self.values.dtype} of shape "
+                f"{self.values.shape}"
+            )
+        if len(units) != width or len(kinds) != width:
+            raise InputError(
+                f"got {len(units)} units and {len(kinds)} kinds for {width} channels{where}; "
+                "give one of each per channel"
+            )
+        for kind in kinds:
+            one_of("kind of channel", kind, KINDS)
+        if kinds.count("quaternion") % 4:
+            raise InputError(
+                f"{kinds.count('quaternion')} channels{where} are called quaternion; four in a "
+                "row make one"
+            )
+        object.__setattr__(self, "channels", tuple(self.channels))
+        object.__setattr__(self, "units", units)
+        object.__setattr__(self, "kinds", kinds)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One file or one episode: signals on one clock, before any policy.
+
+    Args:
+        signals: what was logged; a signal may be empty.
+        label: of the episode, where the file has one.
+        origin: where it came from, for messages and reports.
+        time_unit: the unit that the file itself counts in, for reports: `s`, `ms`, `us`, `ns` or
+            `100ns`.
+        notes: what is to be said aloud about how it was read, such as "stamps are row number /
+            fps".
+        clock_zero: what the file's clock shows at stamp 0, in `time_unit`, where the stamps do not
+            count from the clock's own zero because that would exceed an int64.
+        actions: what was commanded, on the same clock, in the order of time. A row of a trajectory
+            has the action that held then: the last one up to its stamp, or the first one.
+
+    Raises:
+        InputError: the unit is unknown, or there are no actions in `actions`.
+    """
+
+    signals: tuple[Signal, ...]
+    label: str = ""
+    origin: str = ""
+    time_unit: str = "ns"
+    notes: tuple[str, ...] = ()
+    clock_zero: int = 0
+    actions: Signal | None = None
+
+    def __post_init__(self) -> None:
+        one_of("time unit", self.time_unit, NANOSECONDS_PER)
+        if self.actions is not None and not self.actions.values.size:
+            raise InputError("actions must hold a row at least, got none; leave them out")
+        object.__setattr__(self, "signals", tuple(self.signals))
+        object.__setattr__(self, "notes", tuple(self.notes))

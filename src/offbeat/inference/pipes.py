@@ -1,0 +1,115 @@
+"""Lines in, lines out, until the input ends or a signal comes: nothing that was read is lost."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+LONGEST_LINE = 1 << 20
+"""Bytes; a longer line is refused, so that a source without newlines can't fill the memory."""
+
+_CHUNK = 1 << 16
+_MOST_AFTER_STOP = 1 << 20
+
+
+def serve(
+    answer: Callable[[bytes], bytes],
+    refuse: Callable[[str], bytes],
+    *,
+    source: int = 0,
+    sink: int = 1,
+) -> bool:
+    """Answers every line of a file descriptor on another one, each as soon as it is there.
+
+    It ends with the input, and on SIGTERM or SIGINT after answering what had arrived; a second
+    signal does what signals do. A last line without a newline is a line.
+
+    Args:
+        answer: a line, without its newline, to what is written for it; may be empty.
+        refuse: why a line was refused unread, to what is written for it.
+        source: file descriptor to read from.
+        sink: file descriptor to write to.
+
+    Returns:
+        False if whoever read the answers went away before the end.
+    """
+    rest, skipping = b"", False
+    with _stop_signals() as stop:
+        try:
+            for chunk in _chunks(source, stop):
+                *lines, rest = (rest + chunk).split(b"\n")
+                if lines and skipping:
+                    lines, skipping = lines[1:], False
+                for line in lines:
+                    _write(sink, _one(answer, refuse, line))
+                if skipping:
+                    rest = b""
+                elif len(rest) > LONGEST_LINE:
+                    _write(sink, refuse(f"a line is longer than {LONGEST_LINE} bytes"))
+                    rest, skipping = b"", True
+            if rest:
+                _write(sink, _one(answer, refuse, rest))
+        except BrokenPipeError:
+            return False
+    return True
+
+
+def _one(answer: Callable[[bytes], bytes], refuse: Callable[[str], bytes], line: bytes) -> bytes:
+    if len(line) > LONGEST_LINE:
+        return refuse(f"a line is longer than {LONGEST_LINE} bytes")
+    return answer(line)
+
+
+def _chunks(source: int, stop: int) -> Iterator[bytes]:
+    """What arrives; once `stop` can be read, what has arrived already."""
+    budget = _MOST_AFTER_STOP
+    while budget > 0:
+        ready, _, _ = select.select([source, stop], [], [])
+        if source not in ready:
+            return
+        chunk = os.read(source, _CHUNK)
+        if not chunk:
+            return
+        yield chunk
+        if stop in ready:  # nobody empties it, so it stays so
+            budget -= len(chunk)
+
+
+@contextmanager
+def _stop_signals() -> Iterator[int]:
+    """Yields a file descriptor that can be read from the first SIGTERM or SIGINT on."""
+    stop, wake = os.pipe()
+    before: dict[int, Any] = {}
+
+    def put_back() -> None:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        put_back()
+        os.write(wake, b"x")
+
+    try:
+        if threading.current_thread() is threading.main_thread():  # no other is told of signals
+            for number in (signal.SIGTERM, signal.SIGINT):
+                before[number] = signal.signal(number, handle)
+        yield stop
+    finally:
+        put_back()
+        os.close(stop)
+        os.close(wake)
+
+
+def _write(sink: int, data: bytes) -> None:
+    """All of it, however little is taken at a time."""
+    while data:
+        try:
+            data = data[os.write(sink, data) :]
+        except BlockingIOError:
+            select.select([], [sink], [])

@@ -1,0 +1,127 @@
+"""An inspection of a log as text: tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from offbeat.data.inspection import EpisodeFacts, Inspection
+
+_MOST_EPISODES = 12
+
+
+def heading(inspection: Inspection) -> str:
+    """One line on the log as a whole."""
+    episodes = len(inspection.episodes)
+    lasts = sum(episode.duration_s for episode in inspection.episodes)
+    rate = "" if inspection.rate_hz is None else f", {inspection.rate_hz:.4g} Hz"
+    return (
+        f"{inspection.source or 'data set'} ({inspection.format}, times in "
+        f"{inspection.time_unit}): {episodes} episode{'' if episodes == 1 else 's'}, "
+        f"{inspection.rows} rows in {lasts:.6g} s{rate}, {len(inspection.channels)} channels, "
+        f"{100 * inspection.observed:.1f} % of the cells known"
+    )
+
+
+def channel_table(inspection: Inspection) -> str:
+    """A line per channel."""
+    rows = []
+    for c in inspection.channels:
+        held = (
+            "" if not c.rows_per_value else f"{c.rows_per_value} rows ({100 * c.held_share:.0f} %)"
+        )
+        rows.append(
+            (
+                c.name,
+                c.unit,
+                _number(c.rate_hz, 4),
+                _number(None if c.jitter_s is None else round(1000 * c.jitter_s, 4), 3),
+                f"{100 * c.missing:.1f}",
+                f"{100 * c.lost:.1f}",
+                _number(c.longest_gap_s, 4),
+                "constant" if c.constant else held,
+                "never known" if not c.cells else f"{_number(c.low, 4)} to {_number(c.high, 4)}",
+            )
+        )
+    header = (
+        "channel",
+        "unit",
+        "Hz",
+        "jitter ms",
+        "missing %",
+        "lost %",
+        "longest gap s",
+        "held",
+        "range",
+    )
+    return _table([header, *rows], left=(0, 1, 7, 8))
+
+
+def episode_table(inspection: Inspection) -> str:
+    """A line per episode; of many, those with faults and the first ones."""
+    episodes = list(enumerate(inspection.episodes))
+    shown = episodes
+    if len(episodes) > _MOST_EPISODES:
+        faulty = [entry for entry in episodes if _is_faulty(entry[1])]
+        kept = {i for i, _ in [*faulty, *episodes][:_MOST_EPISODES]}
+        shown = [entry for entry in episodes if entry[0] in kept]
+    rows = [
+        (
+            str(i),
+            e.label,
+            str(e.rows),
+            f"{e.duration_s:.4g}",
+            f"{e.longest_step_s:.4g}",
+            _before(e),
+            str(e.late),
+            str(e.duplicates),
+        )
+        for i, e in shown
+    ]
+    header = (
+        "episode",
+        "label",
+        "rows",
+        "lasts s",
+        "longest step s",
+        "before it",
+        "late",
+        "repeated",
+    )
+    text = _table([header, *rows], left=(1, 5))
+    if len(shown) == len(episodes):
+        return text
+    clean = len(episodes) - sum(_is_faulty(e) for _, e in episodes)
+    return f"{text}\n({len(episodes) - len(shown)} more; {clean} of {len(episodes)} without faults)"
+
+
+def _before(episode: EpisodeFacts) -> str:
+    if episode.outage_before_s is not None:
+        return f"outage of {episode.outage_before_s:.4g} s"
+    return "clock set" if episode.clock_set_before else ""
+
+
+def _is_faulty(episode: EpisodeFacts) -> bool:
+    return bool(
+        episode.late
+        or episode.duplicates
+        or episode.clock_set_before
+        or episode.outage_before_s is not None
+    )
+
+
+def _number(value: float | None, digits: int) -> str:
+    if value is None:
+        return ""
+    return f"{value if abs(value) >= 1e-6 else 0.0:.{digits}g}"
+
+
+def _table(rows: Sequence[Sequence[str]], left: Sequence[int]) -> str:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

@@ -1,0 +1,195 @@
+"""Random scans, small and large, for tests that compare bodies."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from offbeat.kernels import ScanRows, ScanSpec, ScanWeights
+
+CELLS: dict[str, dict[str, Any]] = {
+    "none": {"cell": "none"},
+    "set": {"cell": "set"},
+    "elman": {"cell": "elman"},
+    "lstm": {"cell": "lstm"},
+    "gru": {"cell": "gru"},
+    "gru, reset after": {"cell": "gru", "reset_after": True},
+}
+FLOWS: dict[str, dict[str, Any] | None] = {
+    "none": None,
+    "euler": {"solver": "euler"},
+    "euler, several steps": {"solver": "euler", "steps_per_gap": 3},
+    "midpoint": {"solver": "midpoint"},
+    "midpoint, longest step": {"solver": "midpoint", "max_step": 0.3},
+    "heun": {"solver": "heun"},
+    "rk4": {"solver": "rk4"},
+    "rk4, several steps": {"solver": "rk4", "steps_per_gap": 2, "max_step": 0.4},
+}
+
+
+class Problem(NamedTuple):
+    """A scan, and what its results are multiplied by to make a loss."""
+
+    spec: ScanSpec
+    weights: ScanWeights
+    rows: ScanRows
+    state: Tensor
+    factors: tuple[Tensor, Tensor]
+
+    def double(self) -> Problem:
+        """The same numbers in double precision."""
+
+        def cast(value: Any) -> Any:
+            return (
+                value.double()
+                if isinstance(value, Tensor) and value.dtype.is_floating_point
+                else value
+            )
+
+        tensors = [t.detach().double().requires_grad_() for t in self.weights.tensors()]
+        facts = {f.name: cast(getattr(self.rows, f.name)) for f in fields(self.rows)}
+        return self._replace(
+            weights=self.with_weights(tensors),
+            rows=ScanRows(**facts),
+            state=self.state.detach().double().requires_grad_(),
+            factors=(self.factors[0].double(), self.factors[1].double()),
+        )
+
+    def with_weights(self, tensors: Sequence[Tensor]) -> ScanWeights:
+        """The weights with other tensors, in the order of `ScanWeights.tensors`."""
+        left = list(tensors)
+
+        def take(old: Tensor | None) -> Tensor | None:
+            return None if old is None else left.pop(0)
+
+        def pairs(old: Any) -> Any:
+            return tuple((left.pop(0), left.pop(0)) for _ in old)
+
+        old = self.weights
+        names = ("inputs", "bias", "recurrent", "recurrent_bias", "innovation")
+        taken: dict[str, Any] = {name: take(getattr(old, name)) for name in names}
+        for name in ("decay", "input_decay"):
+            taken[name] = None if getattr(old, name) is None else pairs([0])[0]
+        return ScanWeights(**taken, field=pairs(old.field), decoder=pairs(old.decoder))
+
+
+def problem(
+    *,
+    seed: int,
+    batch: int,
+    rows: int,
+    channels: int,
+    hidden: int,
+    cell: str,
+    flow: str,
+    anchored: bool = False,
+    self_feeding: bool = False,
+    input_decay: bool = False,
+    decay: str = "none",
+    decay_rows: str = "continuous",
+    ages: int = 0,
+    activation: str = "tanh",
+    units: tuple[int, ...] = (7, 5),
+    padded: bool = False,
+    scale: float = 0.5,
+    dtype: torch.dtype = torch.float32,
+) -> Problem:
+    """A scan with random weights; about half of the cells are observed, some gaps are 0."""
+    generator = torch.Generator().manual_seed(seed)
+    driven = hidden + (channels if anchored else 0)
+    features = {"none": 0, "ages": channels, "elapsed": 1}[decay]
+    if cell == "none" and flow == "none" and not features:
+        features = 1  # a scan of nothing at all has no weights
+    has_cell = cell != "none"
+    spec = ScanSpec(
+        channels=channels,
+        hidden_size=hidden,
+        anchored=anchored,
+        ages=ages if has_cell else 0,
+        field=() if FLOWS[flow] is None else (driven, *units, driven),
+        activation=activation,  # type: ignore[arg-type]
+        decay=features,
+        decay_rows=decay_rows,  # type: ignore[arg-type]
+        input_decay=input_decay,
+        decoder=(hidden, 6, channels) if self_feeding else (),
+        **{**CELLS[cell], **(FLOWS[flow] or {})},
+    )
+
+    def normal(*shape: int, by: float = scale) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64).mul(by).to(dtype)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    def weight(*shape: int) -> Tensor:
+        return normal(*shape).requires_grad_()
+
+    def layers(sizes: tuple[int, ...]) -> tuple[tuple[Tensor, Tensor], ...]:
+        return tuple((weight(o, i), weight(o)) for i, o in itertools.pairwise(sizes))
+
+    gates = spec.gates
+    weights = ScanWeights(
+        inputs=weight(gates, 2 * channels + ages) if has_cell else None,
+        bias=weight(gates) if has_cell else None,
+        recurrent=weight(gates, hidden) if spec.cell not in ("none", "set") else None,
+        recurrent_bias=weight(hidden) if spec.reset_after else None,
+        innovation=weight(gates, channels) if anchored and has_cell else None,
+        decay=(weight(hidden, features), weight(hidden)) if features else None,
+        input_decay=(weight(channels), weight(channels)) if input_decay else None,
+        field=layers(spec.field),
+        decoder=layers(spec.decoder),
+    )
+    mask = (uniform(batch, rows, channels) < 0.6) & (uniform(batch, rows, 1) < 0.7)
+    mask = mask.to(dtype)
+    update = (mask.sum(dim=2) > 0).to(dtype)
+    gap = uniform(batch, rows)
+    gap[uniform(batch, rows) < 0.1] = 0
+    start = 2 * uniform(batch, rows, features) if features else None
+    length = None
+    if padded:
+        length = torch.randint(1, rows + 1, (batch,), generator=generator)
+    facts = ScanRows(
+        gap=gap,
+        update=update,
+        values=normal(batch, rows, channels, by=1.0) * mask,
+        mask=mask,
+        age=uniform(batch, rows, ages) if ages and has_cell else None,
+        updated=torch.cat([torch.zeros(batch, 1, dtype=dtype), update[:, :-1]], dim=1)
+        if features
+        else None,
+        decay_start=start,
+        decay_end=None if start is None else start + uniform(*start.shape),
+        delta=uniform(batch, rows, channels) if input_decay else None,
+        last=normal(batch, rows, channels, by=1.0) if input_decay else None,
+        mean=normal(channels) if input_decay else None,
+        length=length,
+        fed=tuple(bool(b) for b in uniform(rows) < 0.5) if self_feeding else (),
+    )
+    state = normal(batch, spec.state_size).requires_grad_()
+    factors = tuple(normal(batch, rows, spec.state_size, by=1.0) for _ in range(2))
+    return Problem(spec, weights, facts, state, factors)  # type: ignore[arg-type]
+
+
+def run(scan: Callable[..., tuple[Tensor, Tensor]], case: Problem) -> dict[str, Tensor]:
+    """Both results of a scan, and the gradient of each weight and of the first state."""
+    before, after = scan(case.spec, case.weights, case.rows, case.state)
+    leaves = [*case.weights.tensors(), case.state]
+    loss = (before * case.factors[0]).sum() + (after * case.factors[1]).sum()
+    found = torch.autograd.grad(loss, leaves, allow_unused=True)
+    result = {"before": before.detach(), "after": after.detach()}
+    for i, (gradient, leaf) in enumerate(zip(found, leaves, strict=True)):
+        result[f"gradient {i}"] = torch.zeros_like(leaf) if gradient is None else gradient
+    return result
+
+
+def largest_error(got: Tensor, expected: Tensor) -> float:
+    """The largest error, as a share of the largest entry."""
+    if not expected.numel():
+        return 0.0
+    scale = float(expected.abs().max())
+    return float((got - expected).abs().max()) / (scale if scale > 0 else 1.0)

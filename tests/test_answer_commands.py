@@ -1,0 +1,280 @@
+"""From a log to filled gaps and forecasts, on the command line, and the figures on the way."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from test_cli import one_line_error
+
+import offbeat as ob
+from offbeat.cli import main
+from offbeat.commands.common import answer_columns, plain
+from offbeat.report.answers import answers
+
+NAMES = ("gyro", "tilt", "height")
+PARTS = [
+    "--parts.split=in_time", "--parts.window_s=0.4", "--parts.hide=bursts",
+    "--parts.burst_s=0.05", "--parts.observed_fraction=0.7",
+]  # fmt: skip
+MODEL = ["--model.hidden_size=4", "--model.field_units=[6]", "--training.epochs=1"]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """Two sensors on one clock in ms: gyro and tilt at 100 Hz, height at 25 Hz; cells missing."""
+    path = tmp_path_factory.mktemp("log") / "log.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["stamp", *NAMES])
+        for i in range(400):
+            t = 0.01 * i
+            height = f"{np.sin(t):.6f}" if i % 4 == 0 else ""
+            tilt = f"{np.cos(5 * t):.6f}" if not 100 <= i < 110 else ""
+            writer.writerow([1000 + 10 * i, f"{5 * np.cos(5 * t):.6f}", tilt, height])
+    return path
+
+
+READER = ["--reader.time_column=stamp", "--reader.time_unit=ms"]
+
+
+@pytest.fixture(scope="module")
+def run(log, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "first"
+    arguments = ["train", str(log), str(out), *READER, *PARTS, *MODEL, "--two_sided=true"]
+    assert main(arguments) == 0
+    return out
+
+
+def table(path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_two_sided_run_holds_both_models_and_says_who_wins(run):
+    inside = {path.name for path in run.iterdir()}
+    assert {"model", "backward", "two_sided.json", "reader.json", "parts.json"} <= inside
+    results = json.loads((run / "results.json").read_text())
+    filled = results["imputation"]["rmse_in_units"]
+    assert set(filled) == {"causal", "two_sided", "last_value", "linear", "pchip"}
+    assert set(filled["linear"]) == set(NAMES)
+    assert "win" in results["imputation"]["verdict"]
+    assert "one step ahead" in results["verdict"]
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["two_sided"] is True
+    assert config["reader"] == {"time_column": "stamp", "time_unit": "ms"}
+
+
+def test_the_saved_config_trains_the_same_pair_again(run, log, tmp_path):
+    out = tmp_path / "again"
+    assert main(["train", f"--config={run / 'config.yaml'}", str(log), str(out)]) == 0
+    for name in ("results.json", "two_sided.json"):
+        assert json.loads((out / name).read_text()) == json.loads((run / name).read_text())
+
+
+@pytest.mark.parametrize("mode", ["causal", "two_sided"])
+def test_impute_keeps_what_was_measured_and_fills_the_rest(run, log, tmp_path, mode):
+    out = tmp_path / "filled.csv"
+    assert main(["impute", str(run), str(log), str(out), f"--mode={mode}"]) == 0
+    lines, before = table(out), table(log)
+    assert list(lines[0]) == [
+        "trajectory", "time", "clock_ms", *NAMES, *(f"{n}|observed" for n in NAMES)
+    ]  # fmt: skip
+    assert [int(line["clock_ms"]) for line in lines] == [int(line["stamp"]) for line in before]
+    for line, was in zip(lines, before, strict=True):
+        for name in NAMES:
+            assert (line[f"{name}|observed"] == "true") == (was[name] != "")
+            assert np.isfinite(float(line[name]))
+            assert not was[name] or float(line[name]) == float(was[name])
+    data = ob.read(log, time_column="stamp", time_unit="ms")
+    expected = ob.impute(ob.load_two_sided(run), data, mode=mode)[0]
+    got = [[float(line[name]) for name in NAMES] for line in lines]
+    assert np.array_equal(got, expected.values)
+
+
+def test_impute_writes_the_same_table_as_parquet(run, log, tmp_path):
+    import pyarrow.parquet as pq
+
+    paths = [tmp_path / "filled.csv", tmp_path / "filled.parquet"]
+    for path in paths:
+        assert main(["impute", str(run), str(log), str(path)]) == 0
+    lines, parquet = table(paths[0]), pq.read_table(paths[1])
+    assert parquet.column_names == list(lines[0])
+    for name in NAMES:
+        assert parquet[name].to_pylist() == [float(line[name]) for line in lines]
+        assert parquet[f"{name}|observed"].to_pylist() == [
+            line[f"{name}|observed"] == "true" for line in lines
+        ]
+
+
+def test_extrapolate_answers_after_the_last_row_on_the_clock_of_the_log(run, log, tmp_path):
+    out = tmp_path / "ahead.csv"
+    assert main(["extrapolate", str(run), str(log), str(out), "--horizons=[0.05, 0.2]"]) == 0
+    lines = table(out)
+    assert [float(line["horizon"]) for line in lines] == [0.05, 0.2]
+    assert [int(line["clock_ms"]) for line in lines] == [1000 + 3990 + 50, 1000 + 3990 + 200]
+    assert {line[f"{name}|observed"] for line in lines for name in NAMES} == {"false"}
+    data = ob.read(log, time_column="stamp", time_unit="ms")
+    expected = ob.extrapolate(ob.load_checkpoint(run), data, [0.05, 0.2])[0].values
+    assert np.array_equal([[float(line[name]) for name in NAMES] for line in lines], expected)
+
+
+def test_evaluate_scores_fills_and_forecasts_of_the_part_held_out(run, log, capsys):
+    capsys.readouterr()
+    arguments = ["evaluate", str(run), str(log), "--horizons=[0.02, 0.1]"]
+    assert main([*arguments, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    results = json.loads((run / "results.json").read_text())
+    assert said["part"] == "test"
+    assert said["imputation"] == results["imputation"]
+    assert [part["horizon_s"] for part in said["extrapolation"]] == [0.02, 0.1]
+    for part in said["extrapolation"]:
+        assert set(part["rmse_in_units"]) == {
+            "anchored_ode_gru_d", "last_value", "constant_velocity"
+        }  # fmt: skip
+    assert main(arguments) == 0
+    text = capsys.readouterr().out
+    assert "imputation: " in text
+    assert "extrapolation, 0.1 s: " in text
+    assert "share of the models in the two-sided fill" in text
+    for verdict in (said["imputation"]["verdict"], said["verdict"]):
+        assert verdict in text
+
+
+def test_other_data_is_hidden_in_any_way_and_scored_as_a_whole(run, log, tmp_path, capsys):
+    other = tmp_path / "other.csv"
+    other.write_text("\n".join(log.read_text().splitlines()[:200]) + "\n")
+    capsys.readouterr()
+    hiding = ["--observed_fraction=0.6", "--hide=cells"]
+    assert main(["evaluate", str(run), str(other), *hiding, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["part"] == "all"
+    data = ob.read(other, time_column="stamp", time_unit="ms")
+    hidden = ob.thin(data, 0.6, hide="cells")[0]
+    expected = (data[0].observed & ~hidden.observed).sum(axis=0).tolist()
+    assert list(said["imputation"]["cells"].values()) == expected
+
+
+def test_figures_are_written_on_request(run, log, tmp_path):
+    from PIL import Image
+
+    paths = [tmp_path / f"{name}.png" for name in ("fill", "ahead", "scored")]
+    table_of = str(tmp_path / "a.csv")
+    for arguments in (
+        ["impute", str(run), str(log), table_of, f"--figure={paths[0]}", "--channels=[tilt]"],
+        ["extrapolate", str(run), str(log), table_of, "--horizons=[0.1, 0.2]",
+         f"--figure={paths[1]}"],
+        ["evaluate", str(run), str(log), f"--figure={paths[2]}", "--trajectory=0"],
+    ):  # fmt: skip
+        assert main(arguments) == 0
+    for path in paths:
+        with Image.open(path) as picture:
+            assert picture.size[0] == 1400
+
+
+def test_a_figure_shows_observed_cells_hidden_truth_and_every_answer():
+    times = np.arange(6.0)
+    values = times[:, None] ** 2
+    observed = np.array([True, True, False, False, True, True])[:, None]
+    truth = ob.Trajectory(times, values, observed=observed, names=("a",), units=("m",))
+    filled = ob.Trajectory(times, values + 1 - observed, observed=observed, names=("a",))
+    figure = answers(truth, {"two_sided": filled, "my_fill": filled}, ["a"])
+    (axes,) = figure.axes
+    drawn = {line.get_label(): line for line in axes.get_lines()}
+    assert set(drawn) == {"Model, two-sided", "my_fill", "Hidden truth", "Observed"}
+    assert drawn["Hidden truth"].get_xydata().tolist() == [[2, 4], [3, 9]]
+    assert drawn["Observed"].get_xdata().tolist() == [0, 1, 4, 5]
+    line = drawn["my_fill"].get_ydata()
+    assert line[1:5].tolist() == [1, 5, 10, 16], "from the last observed cell to the next"
+    assert np.isnan(line[[0, 5]]).all()
+    assert axes.get_ylabel() == "a (m)"
+
+
+def test_a_forecast_begins_at_the_last_observation():
+    truth = ob.Trajectory([0.0, 1.0], [[3.0], [4.0]], names=("a",))
+    ahead = ob.Trajectory([2.0], [[6.0]], observed=np.zeros((1, 1), bool), names=("a",))
+    (axes,) = answers(truth, {"gru": ahead}, ["a"]).axes
+    (line,) = [line for line in axes.get_lines() if line.get_label() == "GRU"]
+    assert line.get_xydata().tolist() == [[1, 4], [2, 6]]
+
+
+def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
+    out = tmp_path / "out" / "a.csv"
+    for arguments, message in (
+        (["impute", run, log, out.with_suffix(".txt")], "suffix of out"),
+        (["impute", run, log, log], "the data set itself"),
+        (["impute", run, log, out, "--mode=both"], "unknown mode 'both'"),
+        (["impute", run / "model", log, out, "--mode=two_sided", *READER], "--two_sided true"),
+        (["impute", run, log, out, "--figure=a.gif"], "suffix of figure"),
+        (["impute", run, log, out, "--channels=[tilts]"], "did you mean 'tilt'"),
+        (["impute", run, log, out, "--trajectory=1"], "there is no trajectory 1"),
+        (["impute", run, log, out, "--reader.time_col=stamp"], "did you mean 'time_column'"),
+        (["impute", run, log, out, "--reader.format=cvs"], "did you mean 'csv'"),
+        (["extrapolate", run, log, out], "horizons"),
+        (["extrapolate", run, log, out, "--horizons=0"], "above 0"),
+        (["evaluate", run, log, "--hide=burst"], "did you mean 'bursts'"),
+        (["evaluate", run, log, "--horizons=1000"], "use shorter horizons"),
+        (["train", log, out.parent, *READER, "--parts.hide=cell"], "hide"),
+        (["train", log, out.parent, *READER], "split='in_time'"),
+        (["predict", run, log, out, "--reader.delimiter=;;"], "delimiter"),
+    ):
+        assert message in one_line_error(capsys, *arguments)
+    assert not out.parent.exists(), "bad input writes nothing"
+
+
+def test_a_thesis_model_fills_at_its_rows_and_says_why_it_cannot_extrapolate(log, tmp_path, capsys):
+    out = tmp_path / "run"
+    options = ["--model.name=gru", "--model.readout=last_row", "--model.hidden_size=3"]
+    assert main(["train", str(log), str(out), *READER, *PARTS, *options, *MODEL[2:]]) == 0
+    assert main(["impute", str(out), str(log), str(tmp_path / "a.csv")]) == 0
+    error = one_line_error(capsys, "extrapolate", out, log, tmp_path / "b.csv", "--horizons=0.1")
+    assert "can't be asked for times" in error
+
+
+def test_a_channel_named_like_a_mask_is_refused():
+    names = ("a", "a|observed")
+    data = ob.Dataset((ob.Trajectory([0.0, 1.0], [[1.0, 2.0], [3.0, 4.0]], names=names),))
+    with pytest.raises(ob.InputError, match=r"a channel is called 'a\|observed'"):
+        answer_columns(data, data)
+    assert list(answer_columns(data, data, masks=False))[2:] == list(names)
+
+
+def test_nested_options_are_plain_lists():
+    assert plain({"sensors": (("a", "b"), ("c",)), "n": 3}) == {
+        "sensors": [["a", "b"], ["c"]], "n": 3,
+    }  # fmt: skip
+
+
+def test_the_lasa_example_runs_from_demonstrations_to_scores(tmp_path, capsys):
+    """Real handwriting, one shape, far too little training: what counts is the way through."""
+    root = Path(__file__).parents[1] / "examples"
+    data, out = tmp_path / "lasa.parquet", tmp_path / "run"
+    example = [sys.executable, str(root / "lasa.py"), str(data), "--shapes", "Worm", "--every=20"]
+    subprocess.run(example, check=True, capture_output=True)
+    assert len(ob.load(data)) == 7
+    small = ["--training.epochs=1", *MODEL[:2]]
+    arguments = ["train", f"--config={root / 'lasa.yaml'}", *small, str(data), str(out)]
+    assert main(arguments) == 0
+    results = json.loads((out / "results.json").read_text())
+    assert results["imputation"]["units"] == {"x": "mm", "y": "mm", "vx": "mm/s", "vy": "mm/s"}
+    capsys.readouterr()
+    assert main(["evaluate", str(out), str(data), "--horizons=0.1"]) == 0
+    assert "extrapolation, 0.1 s: " in capsys.readouterr().out
+
+
+def test_the_example_for_one_long_log_runs(log, tmp_path):
+    config = Path(__file__).parents[1] / "examples" / "log.yaml"
+    small = ["--training.epochs=1", "--parts.window_s=0.4", "--parts.burst_s=0.05", *MODEL[:2]]
+    out = tmp_path / "run"
+    assert main(["train", f"--config={config}", *small, *READER, str(log), str(out)]) == 0
+    assert ob.load_two_sided(out).forward.names == NAMES
+    training = yaml.safe_load(config.read_text())["training"]
+    training.pop("keep")
+    training.pop("batch_size")
+    assert ob.train_config("anchored_ode_gru_d", epochs=40) == ob.TrainConfig(**training)

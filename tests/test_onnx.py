@@ -1,0 +1,303 @@
+"""One step as an ONNX graph says what a stream says, and runs without torch."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from model_helpers import small_model, trajectory
+from stream_helpers import message
+from test_contract import FLOAT32, FLOAT64, TOLERANCE, VARIANTS, build, dtypes
+from torch import Tensor
+
+from offbeat import (
+    FileFormatError,
+    InputError,
+    OnnxStream,
+    RecurrentModel,
+    Stream,
+    export_onnx,
+    save_checkpoint,
+)
+from offbeat.cli import main
+from offbeat.inference.onnx_runner import STATE
+from offbeat.inference.step import StreamStep
+from offbeat.models.zoo import ZOO
+
+FIXED = [
+    name
+    for name, config in VARIANTS.items()
+    if not config.self_feeding and config.solver not in ("dopri5", "tsit5")
+]
+EXPORTED = [*sorted(ZOO), "ode_gru_d-decay_rk4", "thesis-ode_gru_d", "gru_d-every"]
+"""The exporter takes seconds, so beside the zoo only what takes another way through the graph."""
+
+
+def made(name: str, dtype: torch.dtype = FLOAT32) -> RecurrentModel:
+    if name == "ode_gru_d-decay_rk4":
+        return small_model("ode_gru_d", dtype=dtype, solver="rk4", steps_per_gap=3)
+    return build(name, dtype)
+
+
+@pytest.fixture(scope="session")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Path of an exported model, made when it is first asked for."""
+    folder, paths = tmp_path_factory.mktemp("onnx"), {}
+
+    def path(name: str, dtype: torch.dtype = FLOAT32) -> Path:
+        key = f"{name}-{dtype}".replace("torch.", "")
+        if key not in paths:
+            paths[key] = folder / f"{key}.onnx"
+            export_onnx(made(name, dtype), paths[key])
+        return paths[key]
+
+    return path
+
+
+def difference(got: Any, expected: Any) -> float:
+    """Largest error as a share of the largest entry."""
+    assert np.shape(got) == np.shape(expected)
+    assert np.isfinite(expected).all()
+    return float(np.abs(np.subtract(got, expected)).max() / np.abs(expected).max())
+
+
+# --- the equations --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", FIXED)
+@dtypes
+def test_the_step_written_out_says_what_a_stream_says(variant: str, dtype: torch.dtype) -> None:
+    """Without the exporter: every option that can be exported, with gaps of all lengths."""
+    model, one = build(variant, dtype), trajectory(4, 14)
+    times = one.times.copy()
+    times[9:] += 0.3  # longer than the limit of the model's clock
+    assert 4 * model.statistics.longest_elapsed < 0.3 or "max_step" in variant
+    step, carry = StreamStep(model), model.empty_carry(1)
+    state: tuple[Tensor, ...] = tuple(getattr(carry, name) for name in STATE)
+    stream, got, expected = Stream(model), [], []
+    for row in range(one.rows):
+        values = np.where(one.observed[row], one.values[row], np.nan)
+        t = torch.tensor([times[row] - times[0]])
+        with torch.no_grad():
+            prediction, *after = step(t, torch.tensor(values)[None], *state)
+        got.append(prediction[0].numpy())
+        expected.append(stream.predict(times[row]))
+        stream.observe(times[row], message(one, row))
+        state = tuple(after)
+    assert [part.dtype for part in state] == [getattr(carry, name).dtype for name in STATE]
+    assert difference(got, expected) < TOLERANCE[dtype]
+
+
+# --- onnxruntime ----------------------------------------------------------------------------------
+
+
+def check_parity(model: RecurrentModel, live: OnnxStream, tolerance: float) -> None:
+    one, stream = trajectory(4, 14), Stream(model, time_unit="ns", late="reorder")
+    ticks = np.round(one.times * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
+    got, expected = [], []
+    for row in range(one.rows):
+        asked = ticks[row] + np.array([0, 10**7, 5 * 10**9])
+        got.append(live.predict(asked))
+        expected.append(stream.predict(asked))
+        for each in (live, stream):
+            assert each.observe(ticks[row], message(one, row)) == "new"
+            if row == 8:
+                assert each.observe(ticks[6] + 1, {"channel_1": 0.5}) == "reordered"
+    assert difference(got, expected) < tolerance
+    assert live.counters == stream.counters
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_an_exported_model_says_what_its_stream_says(name: str, exported: Any) -> None:
+    live = OnnxStream(exported(name), time_unit="ns", late="reorder")
+    model = made(name)
+    assert (live.names, live.units) == (model.names, model.units)
+    check_parity(model, live, 1e-6)
+
+
+def test_an_exported_model_of_double_precision_keeps_it(exported: Any) -> None:
+    """Constants, too: the exporter writes plain numbers down in single precision."""
+    path = exported("ode_gru_d-decay_rk4", FLOAT64)
+    model = made("ode_gru_d-decay_rk4", FLOAT64)
+    check_parity(model, OnnxStream(path, time_unit="ns", late="reorder"), 1e-12)
+
+
+def test_any_runtime_can_run_the_file_from_what_stands_in_it(exported: Any) -> None:
+    """As docs/live.md tells it: names, state and its beginning are in the file."""
+    import onnxruntime
+
+    path = exported("gru_d")
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    facts = json.loads(session.get_modelmeta().custom_metadata_map["offbeat"])
+    inputs = {i.name: (i.type, i.shape) for i in session.get_inputs()}
+    assert list(inputs) == ["t", "values", *STATE]
+    assert inputs["t"] == ("tensor(double)", [1])
+    assert inputs["values"] == ("tensor(double)", [1, 3])
+    assert inputs["state"] == ("tensor(float)", [1, 4])
+    outputs = [o.name for o in session.get_outputs()]
+    assert outputs == ["prediction", *(f"{name}_next" for name in STATE)]
+    inf = np.inf
+    state = {
+        "state": np.array(facts["initial"]["state"], dtype=np.float32),
+        "last": np.array(facts["initial"]["last"], dtype=np.float32),
+        "time": np.array([np.nan]),
+        "start": np.array([inf]),
+        "observed_at": np.array([-inf]),
+        "channel_at": np.full((1, 3), -inf),
+        "updated": np.array([False]),
+    }
+    stream = Stream(made("gru_d"))
+    for t in (0.0, 0.25):
+        values = np.array([[1.0, np.nan, t]])
+        found = session.run(None, {"t": np.array([t]), "values": values, **state})
+        assert difference(found[0][0], stream.predict(t)) < 1e-6
+        stream.observe(t, values[0])
+        state = dict(zip(STATE, found[1:], strict=True))
+    assert facts["names"] == ["channel_0", "channel_1", "channel_2"]
+    assert facts["units"] == ["m"] * 3
+    assert facts["model"] == "gru_d"
+
+
+def test_what_is_no_number_in_single_precision_was_not_measured(exported: Any) -> None:
+    clean, dirty = OnnxStream(exported("gru_d")), OnnxStream(exported("gru_d"))
+    for row, bad in enumerate([np.inf, -1e39, 1e300, np.nan]):
+        clean.observe(0.1 * row, {"channel_0": 1.0})
+        dirty.observe(0.1 * row, {"channel_0": 1.0, "channel_1": bad})
+    assert np.array_equal(clean.predict(1.0), dirty.predict(1.0))
+
+
+def test_a_restored_onnx_stream_goes_on_bit_for_bit(exported: Any) -> None:
+    one, stream = trajectory(4, 10), OnnxStream(exported("gru_d"))
+    for row in range(6):
+        stream.observe(one.times[row], message(one, row))
+    record = json.loads(json.dumps(stream.state(), allow_nan=False))
+    again = OnnxStream(exported("gru_d"))
+    again.restore(record)
+    for row in range(6, 10):
+        assert np.array_equal(again.predict(one.times[row]), stream.predict(one.times[row]))
+        for each in (again, stream):
+            each.observe(one.times[row], message(one, row))
+    with pytest.raises(InputError, match="the model that wrote it"):
+        Stream(made("gru_d")).restore(record)
+    stream.reset()
+    fresh = OnnxStream(exported("gru_d"))
+    assert np.array_equal(stream.predict(0.0), fresh.predict(0.0))
+
+
+def test_it_runs_without_torch(exported: Any) -> None:
+    code = (
+        "import sys\n"
+        "sys.modules['torch'] = None  # an import of it would fail\n"
+        "from offbeat import OnnxStream\n"
+        "stream = OnnxStream(sys.argv[1])\n"
+        "stream.observe(0.0, {'channel_0': 1.0})\n"
+        "print(stream.predict(0.5).tolist())\n"
+        "assert sys.modules['torch'] is None\n"
+    )
+    call = [sys.executable, "-W", "error", "-c", code, str(exported("gru_d"))]
+    found = subprocess.run(call, capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    stream = Stream(made("gru_d"))
+    stream.observe(0.0, {"channel_0": 1.0})
+    assert difference(json.loads(found.stdout), stream.predict(0.5)) < 1e-6
+
+
+# --- the commands ---------------------------------------------------------------------------------
+
+
+def test_the_command_exports_and_the_stream_command_runs_the_file_without_torch(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    model, out = small_model("anchored_ode_gru_d", dtype=FLOAT32), tmp_path / "model.onnx"
+    save_checkpoint(model, tmp_path / "model")
+    assert main(["export", str(tmp_path / "model"), str(out), "--to", "onnx", "--json"]) == 0
+    captured = capfd.readouterr()
+    assert captured.err == ""
+    assert json.loads(captured.out) == {
+        "written": str(out), "model": "anchored_ode_gru_d", "bytes": out.stat().st_size,
+    }  # fmt: skip
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from offbeat.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    lines = b'{"t": 0.0, "values": {"channel_0": 1.0}}\n{"predict": 0.5}\n'
+    call = [sys.executable, "-c", code, "stream", str(out)]
+    found = subprocess.run(call, input=lines, capture_output=True, check=False)
+    assert found.returncode == 0, found.stderr
+    answers = [json.loads(line) for line in found.stdout.splitlines()]
+    stream = Stream(model)
+    stream.observe(0.0, {"channel_0": 1.0})
+    assert difference(list(answers[1]["prediction"].values()), stream.predict(0.5)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"solver": "dopri5"}, "takes as many steps as a gap needs"),
+        ({"solver": "tsit5"}, "takes as many steps as a gap needs"),
+        ({"max_step": 1e-6}, "more than the 256"),
+        ({"self_feeding": 0.5}, "draws a coin"),
+    ],
+)
+def test_what_no_graph_can_do_is_refused_in_one_line(
+    options: dict[str, Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_checkpoint(small_model("ode_rnn", **options), tmp_path / "model")
+    assert main(["export", str(tmp_path / "model"), str(tmp_path / "out.onnx")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
+    assert not (tmp_path / "out.onnx").exists()
+
+
+def test_bad_arguments_of_the_export_command_are_one_line_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, said in (
+        (["none", "out.onnx"], "not a checkpoint"),
+        (["none", "out.pt"], "unknown suffix"),
+        (["none", "out.onnx", "--to=tflite"], "unknown export format 'tflite'"),
+    ):
+        assert main(["export", *arguments]) == 2
+        assert said in capsys.readouterr().err
+    with pytest.raises(InputError, match="suffix"):
+        export_onnx(small_model("gru"), tmp_path / "model.pt")
+
+
+@pytest.mark.parametrize("content", [b"", b"no model", None])
+def test_a_file_that_is_not_ours_is_refused(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "model.onnx"
+    if content is None:
+        import onnx
+
+        graph = onnx.helper.make_graph(
+            [onnx.helper.make_node("Identity", ["x"], ["y"])],
+            "other",
+            [onnx.helper.make_tensor_value_info("x", 1, [1])],
+            [onnx.helper.make_tensor_value_info("y", 1, [1])],
+        )
+        opset = [onnx.helper.make_opsetid("", 20)]
+        model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=10)
+        content = model.SerializeToString()
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="not a model that offbeat export wrote"):
+        OnnxStream(path)
+    with pytest.raises(FileFormatError, match="can't be read"):
+        OnnxStream(tmp_path / "none.onnx")
+
+
+def test_a_file_of_another_version_is_refused(exported: Any, tmp_path: Path) -> None:
+    import onnx
+
+    model = onnx.load(exported("gru_d"))
+    (entry,) = [e for e in model.metadata_props if e.key == "offbeat"]
+    entry.value = json.dumps(json.loads(entry.value) | {"version": 2})
+    onnx.save(model, tmp_path / "model.onnx")
+    with pytest.raises(FileFormatError, match="of version 2, this Offbeat runs"):
+        OnnxStream(tmp_path / "model.onnx")
