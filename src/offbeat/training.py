@@ -92,7 +92,7 @@ def fit(
         raise InputError("patience and keep='best' need a validation part; got none")
     folder = writable(out, folder=True) if out is not None else None
     batch = model.batch(train)
-    held_out = model.batch(validation) if validation is not None else None
+    held_out = HeldOut(model, model.batch(validation)) if validation is not None else None
     with flat_parameters(model) as parameters, threads_for(model):
         return _fit(model, batch, held_out, config, RunState(parameters, config), folder, progress)
 
@@ -100,7 +100,7 @@ def fit(
 def _fit(
     model: RecurrentModel,
     batch: Batch,
-    held_out: Batch | None,
+    held_out: HeldOut | None,
     config: TrainConfig,
     state: RunState,
     folder: Path | None,
@@ -138,6 +138,40 @@ def _fit(
     return FitResult(tuple(state.history), stopped and state.epoch < config.epochs, folder)
 
 
+class HeldOut:
+    """A part that is scored again and again, its facts made once.
+
+    Args:
+        model: its scales and statistics make the facts of the rows.
+        batch: scaled by the model's scaler.
+        size: trajectories at a time.
+    """
+
+    def __init__(self, model: RecurrentModel, batch: Batch, *, size: int = 500) -> None:
+        self.channels = batch.channels
+        with torch.no_grad():
+            parts = (batch.take(slice(i, i + size)) for i in range(0, len(batch), size))
+            self.parts = [(model.facts(part)[0], part) for part in parts]
+
+    def scores(
+        self, model: RecurrentModel, *, seed: int = 0, gap_unit: float | None = None
+    ) -> Scores:
+        """Scores a model as it stands.
+
+        Args:
+            model: to score.
+            seed: of the coins of self-feeding.
+            gap_unit: s; groups the honest score by age, as `ScoreSums` does.
+        """
+        sums = ScoreSums(self.channels, gap_unit=gap_unit)
+        with torch.inference_mode():
+            for rows, part in self.parts:
+                # The same coins for each part, as if they were one batch.
+                coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
+                sums.add(model.run(rows, coins=coins)[0], part)
+        return sums.scores()
+
+
 def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 500) -> Scores:
     """Scores a model on a scaled batch, a part at a time.
 
@@ -147,14 +181,8 @@ def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 
         seed: of the coins of self-feeding.
         size: trajectories at a time.
     """
-    sums = ScoreSums(batch.channels, gap_unit=model.statistics.median_gap)
-    with torch.inference_mode():
-        for first in range(0, len(batch), size):
-            part = batch.take(slice(first, first + size))
-            # The same coins for each part, as if they were one batch.
-            coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
-            sums.add(model(part, coins=coins).predictions, part)
-    return sums.scores()
+    held_out = HeldOut(model, batch, size=size)
+    return held_out.scores(model, seed=seed, gap_unit=model.statistics.median_gap)
 
 
 # --- one epoch ------------------------------------------------------------------------------------
@@ -291,12 +319,12 @@ def train_step(
 def _close_epoch(
     model: RecurrentModel,
     batch: Batch,
-    held_out: Batch | None,
+    held_out: HeldOut | None,
     state: RunState,
     config: TrainConfig,
 ) -> None:
     _check_weights(model, state)
-    scores = validate(model, held_out, seed=config.seed) if held_out is not None else None
+    scores = held_out.scores(model, seed=config.seed) if held_out is not None else None
     if scores is not None and not math.isfinite(scores.rows_1_99.mse) and scores.rows_1_99.cells:
         raise DivergenceError(
             f"the validation MSE turned to {scores.rows_1_99.mse} after epoch {state.epoch + 1}; "
