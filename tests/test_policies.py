@@ -147,7 +147,7 @@ class TestOutages:
         assert dataset.meta["clock_start"] == [0, 13_000 * MS]
         found = report(dataset)["outages"]
         assert (found["found"], found["longest_s"]) == (1, 12.01)
-        assert "1 outages, the longest of 12 s" in " ".join(sentences(report(dataset)))
+        assert "1 outage of 12 s" in " ".join(sentences(report(dataset)))
 
     def test_by_default_more_than_20_usual_steps_and_a_second(self):
         steps = np.full(200, 100)
