@@ -125,7 +125,8 @@ class Illustrations:
         if not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # numpy leaves a file open that it finds damaged; this one is closed by us.
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 return _unpacked(dict(file))
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise FileFormatError(
