@@ -159,7 +159,7 @@ def hidden_states(
     coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
     with torch.inference_mode():
         output = model(model.batch(dataset), coins=coins)
-    first = model.spec.anchored
+    first = model.spec.anchors
     part = slice(first, first + model.hidden_size)
     before, after = (s[..., part].double().numpy() for s in (output.before, output.after))
     return before, after
