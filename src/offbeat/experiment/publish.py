@@ -60,8 +60,9 @@ def _about(
         before = json.loads((to / ABOUT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         before = {}
-    sittings = {line["began_at"]: line for line in before.get("sittings", [])}
-    sittings |= {line["began_at"]: line for line in read_sittings(out / "sittings.json")}
+    lines = [*before.get("sittings", []), *read_sittings(out / "sittings.json")]
+    # Two short ones may begin within one second.
+    sittings = {(line["began_at"], line["seconds"]): line for line in lines}
     ordered = [sittings[began] for began in sorted(sittings)]
     commands = list(before.get("commands", []))
     if command and list(command) not in commands:

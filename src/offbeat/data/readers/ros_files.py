@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, OffbeatError, require
 
 
@@ -100,8 +101,9 @@ def _open_ros2(path: Path) -> Iterator[Bag]:
 
     forms = {MessageDefinitionFormat.MSG: "msg", MessageDefinitionFormat.IDL: "idl"}
     with explained(path):
-        for file in [path] if path.is_file() else path.glob("*.db3"):
-            _check_length(file)
+        inside = sorted(p for form in ("*.db3", "*.mcap") for p in path.glob(form))
+        for file in [path] if path.is_file() else inside:
+            _check_length(require_file(file))
         reader = Reader(path)
         try:
             reader.open()
