@@ -156,7 +156,7 @@ def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], i
         unit: one of `NANOSECONDS_PER`.
 
     Raises:
-        FileFormatError: a time is not finite, or the times span more than 292 years.
+        FileFormatError: a time is not finite, or the times span more than 292 years, 146 in floats.
     """
     factor = NANOSECONDS_PER[one_of("time unit", unit, NANOSECONDS_PER)]
     clock = np.asarray(clock)
@@ -182,10 +182,13 @@ def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], i
             f"times must be finite seconds, got {floats[row]} at row {row}; drop that row"
         )
     whole = float(np.floor(floats[0]))
-    since = np.rint((floats - whole) * factor)
-    if np.abs(since).max() >= 2.0**62 or abs(whole) * factor >= 2.0**62:
+    least, most = float(floats.min()), float(floats.max())
+    if max(abs(least - whole), abs(most - whole)) * factor >= 2.0**62:
         raise FileFormatError(
-            f"times from {floats.min():g} to {floats.max():g} {unit} exceed the 146 years that "
-            "nanoseconds can count; give the unit that they are in with time_unit"
+            f"times from {least:g} to {most:g} {unit} span more than 146 years; give the unit that "
+            "they are in with time_unit"
         )
-    return since.astype(np.int64) + int(whole) * factor, zero
+    since = np.rint((floats - whole) * factor).astype(np.int64)
+    if max(abs(least), abs(most)) * factor >= 2.0**62:
+        return since, int(whole)
+    return since + int(whole) * factor, 0

@@ -1,0 +1,393 @@
+"""Tables and poses in the forms in which other programs write them, and readers of others."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from offbeat.data import readers
+from offbeat.data.readers import FOLDER, Reader, read, register
+from offbeat.errors import FileFormatError, InputError
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def text_file(tmp_path):
+    def written(text, name="walk.csv"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return written
+
+
+def refused(path, message, error=FileFormatError, **options):
+    with pytest.raises(error, match=message) as caught:
+        read(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+def notes_of(dataset):
+    return dataset.meta["report"]["notes"]
+
+
+def same(got, expected):
+    return np.array_equal(got, np.array(expected, dtype=float), equal_nan=True)
+
+
+class TestCsvOfOtherPrograms:
+    def test_may_have_a_first_column_without_a_name_that_counts_rows(self, text_file):
+        for header in (",time,x", "Unnamed: 0,time,x"):
+            dataset = read(text_file(f"{header}\n5,0,1\n6,1,2\n"))
+            assert dataset.names == ("x",)
+            assert "the first column has no name and counts the rows" in notes_of(dataset)[0]
+        refused(text_file(",time,x\n5,0,1\n5,1,2\n"), "no name for column 0")
+
+    @pytest.mark.parametrize("delimiter", [";", "\t"])
+    def test_may_have_another_delimiter_that_is_found(self, text_file, delimiter):
+        text = "time,x y,z\n0,1,2\n1,3,4\n".replace(",", delimiter)
+        assert read(text_file(text)).names == ("x y", "z")
+
+    def test_says_units_in_brackets(self, text_file):
+        dataset = read(
+            text_file("# t [ms],left speed [m/s],angle (deg),x[0]\n0,1,2,3\n500,4,5,6\n")
+        )
+        assert dataset.names == ("left speed", "angle", "x[0]")
+        assert dataset.units == ("m/s", "deg", "")
+        assert dataset[0].times.tolist() == [0.0, 0.5]
+
+    def test_whose_names_differ_by_the_unit_alone_keeps_it_in_the_name(self, text_file):
+        dataset = read(text_file("time,v [m/s],v [km/h]\n0,1,3.6\n"))
+        assert dataset.names == ("v [m/s]", "v [km/h]")
+
+    def test_may_hold_booleans_by_name(self, text_file):
+        dataset = read(text_file("time,closed\n0,True\n1,\n2,False\n"))
+        assert same(dataset[0].values[:, 0], [1, NAN, 0])
+
+    def test_may_have_a_channel_that_is_never_known(self, text_file):
+        dataset = read(text_file("time,x,broken\n0,1,\n1,2,NaN\n"))
+        assert np.isnan(dataset[0].values[:, 1]).all()
+
+    def test_keeps_the_digits_of_decimals_that_a_float_would_lose(self, text_file):
+        dataset = read(text_file("time,x\n1403636580.838555574,1\n1403636580.838555575,2\n"))
+        assert dataset[0].times.tolist() == [0.0, 1e-9]
+        long = "time,x\n0.1234567891234,1\n1.1234567891234,2\n"  # more places than nanoseconds
+        assert read(text_file(long))[0].times.tolist() == [0.0, 1.0]
+
+    def test_may_turn_from_integers_to_decimals(self, text_file):
+        rows = "".join(f"{i},1\n" for i in range(1500)) + "1500.5,1\n"
+        assert read(text_file(f"time,x\n{rows}"))[0].times[-1] == 1500.5
+
+    def test_says_the_unit_that_it_found_aloud(self, text_file, caplog):
+        rows = "".join(f"{1_714_564_800_000 + 20 * i},1\n" for i in range(5))
+        dataset = read(text_file(f"time,x\n{rows}"))
+        assert dataset[0].times.tolist() == [0.0, 0.02, 0.04, 0.06, 0.08]
+        assert "milliseconds since 1970; state it with time_unit" in caplog.text
+        assert notes_of(dataset)[0] in caplog.text
+
+    def test_may_count_windows_ticks(self, text_file):
+        start = 133_590_384_000_000_000
+        rows = "".join(f"{start + 200_000 * i},1\n" for i in range(4))
+        dataset = read(text_file(f"time,x\n{rows}"))
+        assert dataset[0].times.tolist() == [0.0, 0.02, 0.04, 0.06]
+        assert (dataset.meta["time_unit"], dataset.meta["clock_start"]) == ("100ns", [start])
+
+    def test_is_read_over_the_borders_of_its_blocks(self, text_file, monkeypatch):
+        monkeypatch.setattr("offbeat.data.readers.table._BLOCK", 4096)
+        random = np.random.default_rng(0)
+        values = random.normal(size=(2000, 3))
+        rows = "".join(
+            f"{i},{'ab'[i % 2]},{x!r},{y!r},{z!r}\n" for i, (x, y, z) in enumerate(values.tolist())
+        )
+        first, second = read(text_file(f"time_ms,episode,x,y,z\n{rows}"))
+        assert first.values.tobytes("C") == values[::2].tobytes("C")
+        assert second.values.tobytes("C") == values[1::2].tobytes("C")
+
+
+class TestTheLongForm:
+    TEXT = "time,{key},{value}\n0,hip,1\n0,knee,2\n1,hip,3\n1.5,knee,\n2,knee,5\n"
+
+    @pytest.mark.parametrize(("key", "value"), [("channel", "value"), ("Sensor", "Val")])
+    def test_is_found_by_its_columns(self, text_file, key, value):
+        dataset = read(text_file(self.TEXT.format(key=key, value=value)))
+        assert dataset.names == ("hip", "knee")
+        assert dataset[0].times.tolist() == [0.0, 1.0, 1.5, 2.0]
+        assert same(dataset[0].values, [[1, 2], [3, NAN], [NAN, NAN], [NAN, 5]])
+
+    def test_can_be_asked_for_by_its_columns(self, text_file):
+        path = text_file("time,what,much,note\n0,hip,1,7\n1,knee,2,7\n")
+        dataset = read(path, channel_column="what", value_column="much", channels=["knee"])
+        assert (dataset.names, dataset[0].values.tolist()) == (("knee",), [[2.0]])
+        refused(path, "unknown value_column ''", InputError, channel_column="what")
+
+    def test_may_hold_episodes(self, text_file):
+        text = "episode,time,channel,value\na,0,x,1\nb,0,y,2\nb,1,x,3\n"
+        first, second = dataset = read(text_file(text), units={"y": "m"})
+        assert (dataset.names, dataset.units) == (("x", "y"), ("", "m"))
+        assert same(first.values, [[1, NAN]])
+        assert same(second.values, [[NAN, 2], [3, NAN]])
+        assert dataset.meta["labels"] == ["a", "b"]
+
+    def test_with_a_channel_that_is_not_there_is_an_error(self, text_file):
+        path = text_file(self.TEXT.format(key="channel", value="value"))
+        refused(path, "unknown channel 'toe', expected one of: hip, knee", InputError,
+                channels=["toe"])  # fmt: skip
+        broken = text_file("time,channel,value\n0,,1\n")
+        refused(broken, "line 2, column 'channel'; every row must say which channel")
+
+
+class TestParquetOfOtherPrograms:
+    def written(self, tmp_path, columns):
+        pq.write_table(pa.table(columns), tmp_path / "walk.parquet")
+        return tmp_path / "walk.parquet"
+
+    def test_may_hold_lists_of_one_length(self, tmp_path):
+        lists = pa.array([[1.0, 2.0], None, [3.0, 4.0]], pa.list_(pa.float32()))
+        dataset = read(self.written(tmp_path, {"time": [0.0, 0.5, 1.0], "q": lists}))
+        assert dataset.names == ("q.0", "q.1")
+        assert same(dataset[0].values, [[1, 2], [NAN, NAN], [3, 4]])
+
+    @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
+    def test_may_have_time_stamps_that_know_their_unit(self, tmp_path, unit):
+        start = 1_714_564_800 * {"ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
+        stamps = pa.array([start, start + 1], pa.timestamp(unit, tz="UTC"))
+        dataset = read(self.written(tmp_path, {"when": stamps, "x": [1, 2]}), time_column="when")
+        assert dataset[0].times[1] == {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}[unit]
+        assert dataset.meta["clock_start"] == [start]
+
+    def test_may_hold_episodes_integers_and_booleans(self, tmp_path):
+        columns = {"time": [0.0, 1.0, 0.0], "episode_index": [0, 0, 1], "n": [1, None, 3],
+                   "on": [True, False, None]}  # fmt: skip
+        first, second = dataset = read(self.written(tmp_path, columns))
+        assert same(first.values, [[1, 1], [NAN, 0]])
+        assert same(second.values, [[3, NAN]])
+        assert dataset.meta["labels"] == ["0", "1"]
+
+    @pytest.mark.parametrize(
+        ("columns", "message"),
+        [
+            ({"time": [0.0], "mode": ["up"]}, "string in column 'mode', expected numbers; choose"),
+            ({"time": ["noon"], "x": [1.0]}, "string in column 'time', expected times"),
+            ({"x": [1.0]}, "no column of times"),
+            ({"time": [0.0]}, "no channels"),
+            ({"time": pa.array([], pa.float64()), "x": pa.array([], pa.float64())}, "no rows"),
+            ({"time": [0.0, None], "x": [1.0, 2.0]}, "empty cell in row 1, column 'time'"),
+            ({"time": [0.0, 1.0], "q": [[1.0], [1.0, 2.0]]}, "lists of 2 lengths in column 'q'"),
+        ],
+    )
+    def test_with_other_columns_is_an_error_of_one_line(self, tmp_path, columns, message):
+        refused(self.written(tmp_path, columns), message)
+
+    def test_of_text_beside_numbers_can_be_read_by_choosing(self, tmp_path):
+        path = self.written(tmp_path, {"time": [0.0], "mode": ["up"], "x": [1.0]})
+        assert read(path, channels=["x"]).names == ("x",)
+
+
+class TestNpz:
+    def written(self, tmp_path, **arrays):
+        np.savez(tmp_path / "walk.npz", **arrays)
+        return tmp_path / "walk.npz"
+
+    def test_gives_a_channel_per_vector_and_per_column_of_a_matrix(self, tmp_path):
+        path = self.written(tmp_path, t=[0.0, 0.5], grip=[1, 0], q=[[1.0, 2.0], [3.0, 4.0]], dt=0.5)
+        dataset = read(path)
+        assert dataset.names == ("grip", "q.0", "q.1")
+        assert dataset[0].values.tolist() == [[1, 1, 2], [0, 3, 4]]
+        assert notes_of(dataset) == ["arrays without a row per time are left out: dt"]
+        assert read(path, channels=["q.1"]).names == ("q.1",)
+
+    def test_may_name_the_columns_of_its_matrix_and_their_units(self, tmp_path):
+        path = self.written(
+            tmp_path, time=[0.0], x=[[1.0, 2.0]], names=["a", "b"], units=["m", "s"]
+        )
+        assert (read(path).names, read(path).units) == (("a", "b"), ("m", "s"))
+
+    def test_may_hold_episodes_by_label_or_by_axis(self, tmp_path):
+        flat = self.written(tmp_path, time=[0.0, 1.0, 0.0], episode=[4, 4, 2], x=[1.0, 2.0, 3.0])
+        assert read(flat).meta["labels"] == ["4", "2"]
+        times = [[0.0, 1.0], [5.0, NAN]]
+        padded = read(self.written(tmp_path, time=times, x=[[1.0, 2.0], [3.0, 9.0]]))
+        assert [t.values[:, 0].tolist() for t in padded] == [[1.0, 2.0], [3.0]]
+
+    def test_may_have_dates(self, tmp_path):
+        dates = np.array(["2024-05-01T12:00:00.000", "2024-05-01T12:00:00.250"], "datetime64[ms]")
+        assert read(self.written(tmp_path, time=dates, x=[1.0, 2.0]))[0].times.tolist() == [0, 0.25]
+
+    def test_with_pickled_objects_is_refused(self, tmp_path):
+        path = self.written(tmp_path, time=[0.0], x=np.array([{"a": 1}], dtype=object))
+        refused(path, "pickled Python objects.*Offbeat never does")
+
+    @pytest.mark.parametrize(
+        ("arrays", "message"),
+        [
+            ({"x": [1.0]}, "no array of times"),
+            ({"time": [0.0], "x": [1.0, 2.0]}, r"no array with a row for each of the \(1,\) times"),
+            ({"time": ["noon"], "x": [1.0]}, "times of shape .* expected numbers"),
+            ({"time": [0.0], "x": [1.0], "episode": [1, 2]}, "labels of shape"),
+        ],
+    )
+    def test_with_other_arrays_is_an_error_of_one_line(self, tmp_path, arrays, message):
+        refused(self.written(tmp_path, **arrays), message)
+
+
+class TestPoses:
+    TUM = "# time x y z qx qy qz qw\n\n  1.5  1 2 3  0 0 0 1 \r\n2.25 4\t5 6 0 0 0 -1\n"
+
+    def test_of_tum_have_comments_and_any_spaces(self, text_file):
+        for name in ("walk.tum", "walk.txt"):
+            dataset = read(text_file(self.TUM, name))
+            assert dataset.meta["format"] == "tum"
+            assert dataset[0].times.tolist() == [0.0, 0.75]
+            assert dataset[0].values[1].tolist() == [4, 5, 6, 0, 0, 0, 1]  # one rotation, one sign
+            assert dataset.units[:3] == ("m", "m", "m")
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("# nothing\n", "no line of numbers, expected timestamp tx"),
+            ("1 2 3 4 5 6 7 8\n1 2 3\n", "'1 2 3' in line 2, expected eight numbers"),
+            ("1 2 3 4 5 6 7 x\n", "'1 2 3 4 5 6 7 x' in line 1"),
+        ],
+    )
+    def test_of_tum_that_are_none_are_an_error_of_one_line(self, text_file, text, message):
+        refused(text_file(text, "walk.tum"), message)
+
+    def folder(self, tmp_path):
+        for sensor, text in {
+            "imu0": "#timestamp [ns],w_x [rad s^-1]\n0,1.0\n5000000,2.0\n",
+            "pose0": "#timestamp,q_w [],q_x [],q_y [],q_z []\n0,1,0,0,0\n10000000,-1,0,0,0\n",
+            "cam0": "#timestamp [ns],filename\n0,0.png\n",
+        }.items():
+            (tmp_path / "V1" / "mav0" / sensor).mkdir(parents=True)
+            (tmp_path / "V1" / "mav0" / sensor / "data.csv").write_text(text)
+        return tmp_path / "V1"
+
+    def test_of_euroc_merge_the_sensors_of_a_folder(self, tmp_path):
+        dataset = read(self.folder(tmp_path))
+        assert dataset.names == (
+            "imu0.w_x", "pose0.q_w", "pose0.q_x", "pose0.q_y", "pose0.q_z")  # fmt: skip
+        assert dataset.units[0] == "rad s^-1"
+        assert dataset[0].times.tolist() == [0.0, 0.005, 0.01]
+        assert same(dataset[0].values[:, 1], [1, NAN, 1])
+        assert notes_of(dataset) == ["sensors without numbers are left out: cam0"]
+
+    def test_of_euroc_can_be_one_sensor_alone(self, tmp_path):
+        assert read(self.folder(tmp_path), sensors=["imu0"]).names == ("w_x",)
+        refused(tmp_path / "V1", "unknown sensor 'imu1', expected one of: cam0, imu0, pose0",
+                InputError, sensors=["imu1"])  # fmt: skip
+
+
+class TestReadersOfOthers:
+    @pytest.fixture
+    def package(self, tmp_path, monkeypatch):
+        """Installs a package with entry points, as pip would leave it; the registry is put back."""
+
+        def install(**entries):
+            points = "\n".join(f"{name} = {value}" for name, value in entries.items())
+            info = tmp_path / "site" / "other-1.0.dist-info"
+            info.mkdir(parents=True)
+            (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+            (info / "entry_points.txt").write_text(f"[offbeat.readers]\n{points}\n")
+            (tmp_path / "site" / "other_readers.py").write_text(
+                textwrap.dedent("""
+                import numpy as np
+                from offbeat.data.readers import Reader
+                from offbeat.data.recording import Recording, Signal
+
+                def read_steps(path, *, step_ms=1):
+                    stamps = step_ms * 1_000_000 * np.arange(3)
+                    yield Recording((Signal("", stamps, np.ones((3, 1)), ("x",)),))
+
+                READER = Reader("steps", (".steps",), read_steps)
+
+                def make():
+                    return Reader("made", (".made",), read_steps)
+
+                def broken():
+                    raise RuntimeError("out of order")
+            """)
+            )
+            monkeypatch.syspath_prepend(tmp_path / "site")
+            monkeypatch.setattr(readers, "READERS", dict(readers.READERS))
+            readers.load_entry_points.cache_clear()
+
+        yield install
+        readers.load_entry_points.cache_clear()
+        sys.modules.pop("other_readers", None)
+
+    def test_are_found_by_their_entry_points_and_get_the_policies(self, package, text_file):
+        package(steps="other_readers:READER", made="other_readers:make")
+        dataset = read(text_file("any", "walk.steps"), step_ms=20, resample_hz=100)
+        assert dataset[0].times.tolist() == [0.0, 0.01, 0.02, 0.03, 0.04]
+        assert read(text_file("any", "walk.made"))[0].rows == 3
+
+    def test_that_can_not_be_loaded_cost_a_warning_and_nothing_else(self, package, text_file):
+        package(broken="other_readers:broken", none="no_such_module:READER")
+        with pytest.warns(UserWarning, match="'(broken|none)'.*can't be used: .*Error") as warned:
+            assert read(text_file("time,x\n0,1\n")).names == ("x",)
+        assert len(warned) == 2
+
+    def test_of_folders_must_be_able_to_recognise_them(self, monkeypatch):
+        monkeypatch.setattr(readers, "READERS", dict(readers.READERS))
+        with pytest.raises(InputError, match="needs recognises"):
+            register(Reader("album", (FOLDER,), lambda path: []))
+
+    def test_that_finish_their_data_set_take_no_policies(self, monkeypatch, text_file):
+        monkeypatch.setattr(readers, "READERS", dict(readers.READERS))
+        finished = read(text_file("time,x\n0,1\n"))
+        register(Reader("done", (".done",), lambda path: finished))
+        path = text_file("any", "walk.done")
+        assert read(path) is finished
+        refused(path, "finished data set, to which policies no longer apply, got held", InputError,
+                held="mask")  # fmt: skip
+
+    def test_a_folder_of_nothing_known_is_an_error_of_one_line(self, tmp_path):
+        refused(tmp_path, "is an empty folder")
+        (tmp_path / "notes.doc").write_text("x")
+        refused(tmp_path, "is a folder of no known format, expected one of: .*euroc")
+
+
+PEAK = """
+import sys, numpy as np, pyarrow.csv, pyarrow.parquet
+import offbeat.data.readers as readers
+def peak():
+    line = next(x for x in open("/proc/self/status") if x.startswith("VmHWM"))
+    return int(line.split()[1]) * 1024
+before = peak()
+trajectory = readers.read(sys.argv[1])[0]
+print(peak() - before, trajectory.values.nbytes + trajectory.observed.nbytes)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /proc")
+@pytest.mark.parametrize(("suffix", "buffers"), [(".csv", 64 << 20), (".parquet", 256 << 20)])
+def test_beside_the_data_set_a_table_takes_a_third_of_it_and_buffers(tmp_path, suffix, buffers):
+    """Those of Arrow do not grow with the file; the whole table beside its values is three times."""
+    import pyarrow.csv as pv
+
+    rows = 800_000
+    random = np.random.default_rng(0)
+    columns = {"time_ns": 5_000_000 * np.arange(rows)}
+    columns |= {f"c{i}": np.round(random.normal(size=rows), 5) for i in range(30)}
+    path = tmp_path / f"big{suffix}"
+    if suffix == ".csv":
+        pv.write_csv(pa.table(columns), path)
+    else:
+        pq.write_table(pa.table(columns), path)
+    done = subprocess.run(
+        [sys.executable, "-c", PEAK, str(path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=250,
+    )
+    grown, kept = map(int, done.stdout.split())
+    assert kept <= grown <= 1.35 * kept + buffers
