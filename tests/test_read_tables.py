@@ -370,7 +370,7 @@ print(peak() - before, trajectory.values.nbytes + trajectory.observed.nbytes)
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /proc")
 @pytest.mark.parametrize(("suffix", "buffers"), [(".csv", 64 << 20), (".parquet", 256 << 20)])
 def test_beside_the_data_set_a_table_takes_a_third_of_it_and_buffers(tmp_path, suffix, buffers):
-    """Those of Arrow do not grow with the file; the whole table beside its values is three times."""
+    """Those of Arrow do not grow with the file. The whole table and its values are three times."""
     import pyarrow.csv as pv
 
     rows = 800_000
