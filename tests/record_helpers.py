@@ -111,7 +111,7 @@ def one_run(seed, experiment, fraction, repeat, model, draw, epochs, factors):
         "seed_draw": 100_000 * experiment + 1000 * round(100 * fraction) + repeat,
         "seed_weights": LABELS.index(model) + 1,
         "commit": "1234567",  # all digits, as a commit can be
-        "code": "0e12345",
+        "bits": "0e12345",
         "cpu": "A processor",
         "kernel_body": "fused",
         "threads": 1,

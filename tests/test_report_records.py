@@ -33,7 +33,7 @@ def test_a_record_is_read_as_it_was_written(record, tmp_path, suffix):
 def test_a_commit_of_digits_alone_stays_a_commit(record, tmp_path):
     read = read_record(made.write(record, tmp_path / "runs", suffix=".csv"))
     assert set(read.runs["commit"]) == {"1234567"}
-    assert set(read.runs["code"]) == {"0e12345"}
+    assert set(read.runs["bits"]) == {"0e12345"}
 
 
 def test_runs_are_found_by_what_they_are_in_the_order_of_the_repeats(record):

@@ -8,6 +8,7 @@ import signal
 from dataclasses import asdict, replace
 
 import pytest
+import torch
 from experiment_helpers import (
     LONG,
     ONLY,
@@ -20,11 +21,13 @@ from experiment_helpers import (
 )
 
 import offbeat as ob
+from offbeat import kernels
 from offbeat.cli import main
 from offbeat.experiment import execute as execution
-from offbeat.experiment import provenance, session
 from offbeat.experiment import reproduce as command
+from offbeat.experiment import session
 from offbeat.experiment.execute import execute
+from offbeat.experiment.fingerprint import fingerprint
 from offbeat.experiment.progress import seconds_left
 from offbeat.experiment.protocol import Protocol, select
 from offbeat.experiment.publish import publish
@@ -263,7 +266,7 @@ def other_machine(done, folder, names, **changes):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"code": "0" * 12}, {"cpu": "Another CPU"}, {"kernel_body": "generic"}, {"data": "0" * 12}],
+    [{"bits": "0" * 12}, {"cpu": "Another CPU"}, {"kernel_body": "generic"}, {"data": "0" * 12}],
 )
 def test_runs_made_otherwise_are_refused_with_what_differs(done, tmp_path, here, changes):
     names = [run.run_id for run in SMALL.runs()[:2]]
@@ -313,14 +316,14 @@ def test_a_run_that_other_code_began_is_begun_again(long_record, tmp_path, here)
     with config.with_name(".lock").open() as lock:  # its process ends with the killed one
         wait_until(lambda: free(lock))
     kept = json.loads(config.read_text(encoding="utf-8"))
-    kept["provenance"]["code"] = "0" * 12
+    kept["provenance"]["bits"] = "0" * 12
     config.write_text(json.dumps(kept), encoding="utf-8")
     relic = log.with_name("relic")
     relic.touch()
     result = reproduce(LONG, out, only=ONLY, progress=False)
     assert numbers(result.record) == numbers(long_record)
     now = json.loads(config.read_text(encoding="utf-8"))
-    assert now["provenance"]["code"] == provenance.code()
+    assert now["provenance"]["bits"] == fingerprint()
     assert now["seconds_before"] == 0.0
     assert not relic.exists()
 
@@ -336,22 +339,18 @@ def free(lock) -> bool:
     return True
 
 
-def test_the_code_that_numbers_depend_on_has_a_hash_of_its_own(tmp_path):
-    package = tmp_path / "src" / "offbeat"
-    shutil.copytree(provenance.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    before = provenance.code(package)
-    for name in ("report/style.py", "commands/train.py", "cli.py", "data/readers/table.py"):
-        (package / name).write_text("# changed\n", encoding="utf-8")
-    (package / "new.py").write_text("", encoding="utf-8")
-    assert provenance.code(package) == before
-    seen = {before}
-    for name in ("training.py", "models/zoo.py", "kernels/reference.py", "experiment/protocol.py"):
-        (package / name).write_text("# changed\n", encoding="utf-8")
-        seen.add(provenance.code(package))
-    (tmp_path / "csrc").mkdir()
-    (tmp_path / "csrc" / "scan.cpp").write_text("// fused\n", encoding="utf-8")
-    seen.add(provenance.code(package))
-    assert len(seen) == 6
+def test_a_fingerprint_tells_arithmetic_apart_and_nothing_else():
+    own = fingerprint()
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)  # threads change no bit
+    try:
+        assert fingerprint.__wrapped__() == own
+    finally:
+        torch.set_num_threads(before)
+    assert fingerprint(replace(Protocol(), anchored_clip_norm=0.5)) != own
+    if kernels.fused.bodies():
+        with kernels.use("reference"):
+            assert fingerprint.__wrapped__() != own
 
 
 # --- bad input ------------------------------------------------------------------------------------

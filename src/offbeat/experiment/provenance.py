@@ -1,12 +1,11 @@
-"""Where numbers come from: the commit, the code, the processor and the libraries of this process.
+"""Where numbers come from: the commit, the processor and the libraries of this process.
 
 Sums in another order end in other last digits, and training lets them grow. So runs that were made
-by other code, on another kind of processor or by another kernel body are told apart.
+by code that adds otherwise, on another kind of processor or by another kernel body are told apart.
 """
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import subprocess
 from dataclasses import dataclass
@@ -15,27 +14,6 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 
-NUMBERS_FROM = (
-    "config.py",
-    "data/batch.py",
-    "data/prepare.py",
-    "data/thin.py",
-    "data/trajectory.py",
-    "solvers",
-    "kernels",
-    "models",
-    "scores.py",
-    "run_state.py",
-    "training.py",
-    "evaluation.py",
-    "experiment/protocol.py",
-    "experiment/execute.py",
-)
-"""Files and folders of the package that a run's numbers depend on, given the recorded data."""
-
-_LIVE_ONLY = ("live.hpp", "stream.hpp")
-"""C++ that runs streams and no training."""
-
 
 @dataclass(frozen=True)
 class Provenance:
@@ -43,14 +21,14 @@ class Provenance:
 
     Attributes:
         commit: `git describe` of the checkout, `-dirty` with changes; else the package's version.
-        code: hash of the source that numbers depend on; equal at commits that don't touch it.
+        bits: fingerprint of small trainings; equal where the code ends in the same numbers.
         cpu: name of the processor.
         kernel_body: which body of the scan ran.
         torch: version.
     """
 
     commit: str
-    code: str
+    bits: str
     cpu: str
     kernel_body: str
     torch: str
@@ -65,7 +43,9 @@ class Provenance:
 def _here() -> Provenance:
     import torch
 
-    return Provenance(commit(), code(), cpu(), kernel_body(), torch.__version__)
+    from offbeat.experiment.fingerprint import fingerprint
+
+    return Provenance(commit(), fingerprint(), cpu(), kernel_body(), torch.__version__)
 
 
 def kernel_body() -> str:
@@ -92,26 +72,6 @@ def commit() -> str:
     if not top or Path(top).resolve() / "src" / "offbeat" != PACKAGE.resolve():
         return f"offbeat {__version__}"
     return git("describe", "--always", "--dirty", "--abbrev=12") or f"offbeat {__version__}"
-
-
-def code(package: Path = PACKAGE) -> str:
-    """A hash of the source that numbers depend on, of the C++ source too where it is at hand.
-
-    Args:
-        package: folder of the package.
-    """
-    files: list[Path] = []
-    for name in NUMBERS_FROM:
-        path = package / name
-        files += sorted(path.rglob("*.py")) if path.is_dir() else [path]
-    root = package.parents[1]
-    if (root / "src" / package.name) == package:
-        files += sorted(p for p in (root / "csrc").rglob("*") if p.name not in _LIVE_ONLY)
-    digest = hashlib.sha256()
-    for path in files:
-        digest.update(f"{path.relative_to(root).as_posix()}\0".encode())
-        digest.update(path.read_bytes() + b"\0")
-    return digest.hexdigest()[:12]
 
 
 def cpu() -> str:

@@ -39,7 +39,7 @@ RUN_COLUMNS: dict[str, type] = {
     "seed_draw": int,
     "seed_weights": int,
     "commit": str,
-    "code": str,
+    "bits": str,
     "cpu": str,
     "kernel_body": str,
     "threads": int,
@@ -62,7 +62,7 @@ CURVE_COLUMNS: dict[str, type] = {
 }
 """Columns of the table of curves, a line per epoch; `seconds` is the training time of the epoch."""
 
-GROUP = ("code", "cpu", "kernel_body", "torch", "data")
+GROUP = ("bits", "cpu", "kernel_body", "torch", "data")
 """Runs that agree in these were made alike; those that do not are never mixed in silence."""
 
 _TABLES = {"record": RUN_COLUMNS, "curves": CURVE_COLUMNS}

@@ -18,7 +18,7 @@ from offbeat.report.tables import label, percent
 
 _NAMES = {
     "commit": "commit",
-    "code": "code (hash of the source that numbers depend on)",
+    "bits": "bits (fingerprint of small trainings)",
     "cpu": "processor",
     "kernel_body": "kernel body",
     "threads": "threads per run",
@@ -144,7 +144,7 @@ def mixing(record: Record) -> tuple[str, ...]:
         if len(counts) > 1:
             parts = "; ".join(f"{value or 'not known'}: {n}" for value, n in counts.items())
             said.append(f"The runs do not share one {_NAMES[column]}. Runs by value: {parts}.")
-    if len(record.counts("commit")) > 1 and len(record.counts("code")) == 1:
+    if len(record.counts("commit")) > 1 and len(record.counts("bits")) == 1:
         said.append("The commits differ in nothing that numbers depend on: the code is the same.")
     return tuple(said)
 

@@ -17,7 +17,7 @@ METRICS = ("honest", "honest_hidden", "rows_1_99", "published")
 LAST_VALUE = "last_value"
 """Name of the trivial predictor that is scored beside every run."""
 
-PROVENANCE = ("commit", "code", "cpu", "kernel_body", "torch")
+PROVENANCE = ("commit", "bits", "cpu", "kernel_body", "torch")
 """What runs that are compared should have in common; where they have not, it is said."""
 
 _CONDITION = ("condition", "data", "experiment", "observed_fraction")

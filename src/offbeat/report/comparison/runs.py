@@ -52,7 +52,7 @@ def read_runs(
 
     A table has a row per run, with columns `model`, `repeat` and `<metric>_mse` (`honest_mse`,
     ...), and as far as there are any `run_id`, `condition`, `data`, `experiment`,
-    `observed_fraction`, `seed_draw`, `last_value_<metric>_mse`, `commit`, `code`, `cpu`,
+    `observed_fraction`, `seed_draw`, `last_value_<metric>_mse`, `commit`, `bits`, `cpu`,
     `kernel_body`, `torch`.
 
     Args:
