@@ -28,7 +28,8 @@ def walks() -> Dataset:
     """Random walks on a grid of 5 ms, the same bits on every machine: sums of small integers."""
     steps = np.random.default_rng(0).integers(-8, 9, (_TRAJECTORIES, _ROWS, _CHANNELS))
     values = steps.cumsum(axis=1).astype(np.float64) / 64
-    return Dataset(tuple(Trajectory(0.005 * np.arange(_ROWS), each) for each in values))
+    times = 0.005 * np.arange(_ROWS, dtype=np.float64)
+    return Dataset(tuple(Trajectory(times, each) for each in values))
 
 
 @cache
