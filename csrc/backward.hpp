@@ -5,7 +5,7 @@
 // gradient's own traffic through the cache is paid once per group.
 
 // Products that wait to be added: to_out (out, lane) times x (in, lane), summed over lanes.
-static constexpr int MAX_PAIRS = 64, PAIRS_AT_ONCE = 8;
+static constexpr int MAX_PAIRS = 128, PAIRS_AT_ONCE = 8;
 struct Pairs {
   int count[M_END] = {};
   const T* to_out[M_END][MAX_PAIRS];
@@ -13,14 +13,14 @@ struct Pairs {
 };
 
 template <int R, int NV>
-static INLINE void outer_tile(int pairs, int W, const T* const* to_out, int o, const T* xt,
-                              int64_t in, int i, T* sum) {
+static INLINE void outer_tile(int pairs, int W, int lanes, const T* const* to_out, int o,
+                              const T* xt, int64_t in, int i, T* sum) {
   V acc[R][NV];
   for (int r = 0; r < R; ++r)
     for (int v = 0; v < NV; ++v) acc[r][v] = load<T>(sum + (o + r) * in + i + v * VW);
   for (int e = 0; e < pairs; ++e) {
     const T* g = to_out[e] + int64_t(o) * W;
-    for (int lane = 0; lane < W; ++lane) {
+    for (int lane = 0; lane < lanes; ++lane) {
       V xv[NV];
       for (int v = 0; v < NV; ++v) xv[v] = load<T>(xt + i + v * VW);
       xt += in;
@@ -36,40 +36,41 @@ static INLINE void outer_tile(int pairs, int W, const T* const* to_out, int o, c
 
 // All outputs against one strip of NV vectors of inputs; R * NV sums at a time hide their latency.
 template <int R, int NV>
-static NOINLINE void outer_strip(int pairs, int W, const T* const* to_out,
-                                                  int out, const T* xt, int in, int i, T* sum) {
+static NOINLINE void outer_strip(int pairs, int W, int lanes, const T* const* to_out, int out,
+                                 const T* xt, int in, int i, T* sum) {
   int o = 0;
-  for (; o + R <= out; o += R) outer_tile<R, NV>(pairs, W, to_out, o, xt, in, i, sum);
-  for (; o < out; ++o) outer_tile<1, NV>(pairs, W, to_out, o, xt, in, i, sum);
+  for (; o + R <= out; o += R) outer_tile<R, NV>(pairs, W, lanes, to_out, o, xt, in, i, sum);
+  for (; o < out; ++o) outer_tile<1, NV>(pairs, W, lanes, to_out, o, xt, in, i, sum);
 }
 
-// [unit][lane] to [lane][unit], units padded with zeros.
-static void turn(const T* x, int units, int padded, int W, T* xt) {
-  T* lanes[2 * VW];
-  for (int lane = 0; lane < W; ++lane) {
-    lanes[lane] = xt + int64_t(lane) * padded;
-    for (int u = units; u < padded; ++u) lanes[lane][u] = 0;
+// [unit][lane] to [lane][unit], units padded with zeros; of the lanes that there are.
+static void turn(const T* x, int units, int padded, int W, int lanes, T* xt) {
+  T* to[2 * VW];
+  for (int lane = 0; lane < lanes; ++lane) {
+    to[lane] = xt + int64_t(lane) * padded;
+    for (int u = units; u < padded; ++u) to[lane][u] = 0;
   }
-  units_to_lanes(x, units, W, W, lanes);
+  units_to_lanes(x, units, lanes, W, to);
 }
 
-static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, const T* const* to_out, const T* const* x,
-                      T* sums, T* xt) {
+static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, int lanes,
+                               const T* const* to_out, const T* const* x, T* sums, T* xt) {
   const int in = up(m.in, VW);
   T* sum = sums + m.sum;
   for (int first = 0; first < pairs; first += PAIRS_AT_ONCE) {
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
-    for (int e = 0; e < n; ++e) turn(x[first + e], m.in, in, W, xt + int64_t(e) * W * in);
+    for (int e = 0; e < n; ++e)
+      turn(x[first + e], m.in, in, W, lanes, xt + int64_t(e) * lanes * in);
     for (int i = 0; i < in;) {  // strips of three vectors, the rest in pairs where it can be
       const int left = (in - i) / VW;
       if (left == 3 || left > 4) {
-        outer_strip<4, 3>(n, W, to_out + first, m.out, xt, in, i, sum);
+        outer_strip<4, 3>(n, W, lanes, to_out + first, m.out, xt, in, i, sum);
         i += 3 * VW;
       } else if (left >= 2) {
-        outer_strip<4, 2>(n, W, to_out + first, m.out, xt, in, i, sum);
+        outer_strip<4, 2>(n, W, lanes, to_out + first, m.out, xt, in, i, sum);
         i += 2 * VW;
       } else {
-        outer_strip<8, 1>(n, W, to_out + first, m.out, xt, in, i, sum);
+        outer_strip<8, 1>(n, W, lanes, to_out + first, m.out, xt, in, i, sum);
         i += VW;
       }
     }
@@ -84,10 +85,10 @@ static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, const T* const
   }
 }
 
-static void flush(const Map& map, Pairs& pairs, int W, T* sums, T* xt) {
+static void flush(const Map& map, Pairs& pairs, int W, int lanes, T* sums, T* xt) {
   for (int i = 0; i < M_END; ++i) {
     if (!pairs.count[i]) continue;
-    add_pairs(map.m[i], pairs.count[i], W, pairs.to_out[i], pairs.x[i], sums, xt);
+    add_pairs(map.m[i], pairs.count[i], W, lanes, pairs.to_out[i], pairs.x[i], sums, xt);
     pairs.count[i] = 0;
   }
 }
@@ -125,7 +126,7 @@ struct Back {
   T *z, *shown, *stage_gradients;  // scratch
 
   void push(int id, const T* to_out, const T* x) {
-    if (pairs.count[id] == MAX_PAIRS) flush(c.map, pairs, P::W, sums, xt);
+    if (pairs.count[id] == MAX_PAIRS) flush(c.map, pairs, P::W, c.lanes, sums, xt);
     const int n = pairs.count[id]++;
     pairs.to_out[id][n] = to_out;
     pairs.x[id][n] = x;
@@ -145,10 +146,10 @@ static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int 
     const T* value = l ? kept + int64_t(n.value[l - 1]) * W : x;
     k.push(first + l, to_out, value);
     if (l == 0) {
-      P::template transposed<false>(m, k.c.packed, to_out, to_x);
+      P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, to_x);
       break;
     }
-    P::template transposed<false>(m, k.c.packed, to_out, k.z);
+    P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, k.z);
     to_out -= int64_t(shape.sizes[l]) * W;
     activate_backward<P>(shape.activation, shape.sizes[l], value,
                          kept + int64_t(n.slope[l - 1]) * W, k.z, to_out);
@@ -175,13 +176,13 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
     k.push(M_IN, gate, at(l.u));
     if (d.A) {
       k.push(M_INNOV, gate, at(l.innovation));
-      P::template transposed<false>(c.map.m[M_INNOV], c.packed, gate, k.z);
+      P::template transposed<false>(c.map.m[M_INNOV], c.packed, c.lanes, gate, k.z);
       P::each(d.A, [&](int64_t i, int) {
         const V m = load<T>(f.mask + i);
         store<T>(g + i, (1 - m) * load<T>(g + i) - m * load<T>(k.z + i));
       });
     }
-    if (shown_matters) P::template transposed<false>(c.map.m[M_IN], c.packed, gate, k.shown);
+    if (shown_matters) P::template transposed<false>(c.map.m[M_IN], c.packed, c.lanes, gate, k.shown);
   }
   collect<P>(job, b, job.to_before, row, d.S, true, g);
 
@@ -358,7 +359,7 @@ static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape,
       store<T>(to_gate + 3 * n + i, new_h * bent * output * (1 - output));
     });
     k.push(M_REC, to_gate, h);
-    P::template transposed<true>(c.map.m[M_REC], c.packed, to_gate, gh);
+    P::template transposed<true>(c.map.m[M_REC], c.packed, c.lanes, to_gate, gh);
     return;
   }
   T* to_held = slot + int64_t(k.slots.held) * W;
@@ -378,10 +379,10 @@ static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape,
   });
   if (s.reset_after) {
     k.push(M_CAND, to_held, h);
-    P::template transposed<true>(c.map.m[M_CAND], c.packed, to_held, gh);
+    P::template transposed<true>(c.map.m[M_CAND], c.packed, c.lanes, to_held, gh);
   } else {
     k.push(M_CAND, to_gate + 2 * n, held);
-    P::template transposed<false>(c.map.m[M_CAND], c.packed, to_gate + 2 * n, to_reset);
+    P::template transposed<false>(c.map.m[M_CAND], c.packed, c.lanes, to_gate + 2 * n, to_reset);
     P::each(d.H, [&](int64_t i, int) {
       const V r = load<T>(gate + n + i), g = load<T>(to_reset + i);
       store<T>(to_gate + n + i, g * load<T>(h + i) * r * (1 - r));
@@ -389,7 +390,7 @@ static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape,
     });
   }
   k.push(M_REC, to_gate, h);
-  P::template transposed<true>(c.map.m[M_REC], c.packed, to_gate, gh);
+  P::template transposed<true>(c.map.m[M_REC], c.packed, c.lanes, to_gate, gh);
 }
 
 static int widest_input(const Map& map) {
@@ -425,7 +426,7 @@ static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratc
   const int64_t W = P::W;
   T* g = take(d.S * W);
   T* state = take(d.S * W);
-  const Context<P> c = context<P>(job, p, take(work_size<P>(s)));
+  const Context<P> c = context<P>(job, b, p, take(work_size<P>(s)));
   const int64_t row_size = int64_t(c.l.size) * W, slot_size = int64_t(places.size) * W;
   const int64_t fact_size = facts_size(d, P::W);
   Pairs pairs;
@@ -464,7 +465,7 @@ static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratc
       row_backward<P>(k, f[row - first], tape, gradients + (row - first) * slot_size, g, job, b,
                       row);
     }
-    flush(p, pairs, P::W, sums, xt);
+    flush(p, pairs, P::W, b.lanes, sums, xt);
   }
   if (job.to_state) {
     Grid<T> grid{job.to_state, d.S, 0};

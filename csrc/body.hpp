@@ -65,9 +65,7 @@ struct Scan {
     int64_t packed_vectors = 0;
   };
 
-#ifndef TILE
-#define TILE 4
-#endif
+  static constexpr int TILE = 4;
 
   static void segments(Matrix& m, int n, int each) {
     m.splits = n;
@@ -271,6 +269,41 @@ struct Scan {
         for (int v = 0; v < NV; ++v) store<T>(y + r * W + v * VW, acc[r][v]);
   }
 
+  // The same for `LANES` lanes of a vector that is mostly empty: vectors over the outputs of N panels,
+  // so that lanes which are not there cost nothing. They are set to 0.
+  template <int LANES, int N, bool ACCUMULATE>
+  static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y) {
+    static_assert(TILE == 4, "a panel is four floats wide");
+    F4 acc[N][LANES];
+    for (int n = 0; n < N; ++n)
+      for (int lane = 0; lane < LANES; ++lane)
+        for (int r = 0; r < TILE; ++r) {
+          const int o = n * TILE + r;
+          acc[n][lane][r] = ACCUMULATE ? (o < rows ? y[o * VW + lane] : T(0))
+                                       : (bias ? bias[o] : T(0));
+        }
+    for (int k = 0; k < in; ++k)
+      for (int n = 0; n < N; ++n) {
+        const F4 wv = load_four(w + (int64_t(n) * in + k) * TILE);
+        for (int lane = 0; lane < LANES; ++lane)
+          acc[n][lane] = fma_four(wv, x[int64_t(k) * VW + lane] - F4{}, acc[n][lane]);
+      }
+    for (int o = 0; o < N * TILE && o < rows; ++o) {
+      store<T>(y + o * VW, splat(0));
+      for (int lane = 0; lane < LANES; ++lane) y[o * VW + lane] = acc[o / TILE][lane][o % TILE];
+    }
+  }
+  template <int LANES, int N, bool ACCUMULATE>
+  static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y) {
+    int o = 0;
+    for (; o + N * TILE <= out; o += N * TILE)
+      few_panels<LANES, N, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, N * TILE, in,
+                                       x, y + int64_t(o) * VW);
+    for (; o < out; o += TILE)
+      few_panels<LANES, 1, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, out - o, in,
+                                       x, y + int64_t(o) * VW);
+  }
+
   // A policy of lanes: a block of NV vectors of lanes, or the one lane of a stream.
   template <int NV>
   struct Many {
@@ -278,21 +311,27 @@ struct Scan {
     static constexpr bool ONE = false;
     static int pad(int n) { return n; }
     template <bool ACCUMULATE>
-    static NOINLINE void affine(const Matrix& m, const T* packed, const T* x, T* y) {
-      const T* w = packed + m.panels;
-      const T* bias = m.bias >= 0 ? packed + m.packed_bias : nullptr;
-      for (int o = 0; o < m.out; o += TILE)
-        panel<NV, ACCUMULATE>(w + int64_t(o) * m.in, bias ? bias + o : nullptr,
-                              m.out - o < TILE ? m.out - o : TILE, m.in, x, y + int64_t(o) * W);
+    static NOINLINE void affine(const Matrix& m, const T* packed, int lanes, const T* x, T* y) {
+      product<ACCUMULATE>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out,
+                          m.in, lanes, x, y);
     }
     // x[k] (+)= sum over o of w[o][k] y[o]
     template <bool ACCUMULATE>
-    static NOINLINE void transposed(const Matrix& m, const T* packed, const T* y, T* x) {
-      const T* w = packed + m.transposed;
-      for (int i = 0; i < m.backward_in; i += TILE)
-        panel<NV, ACCUMULATE>(w + int64_t(i) * m.out, nullptr,
-                              m.backward_in - i < TILE ? m.backward_in - i : TILE, m.out, y,
-                              x + int64_t(i) * W);
+    static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
+      product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x);
+    }
+    template <bool ACCUMULATE>
+    static INLINE void product(const T* w, const T* bias, int out, int in, int lanes, const T* x,
+                               T* y) {
+      if constexpr (NV == 1 && sizeof(T) == 4) {
+        if (lanes == 1) return few<1, 8, ACCUMULATE>(w, bias, out, in, x, y);
+        if (lanes == 2) return few<2, 4, ACCUMULATE>(w, bias, out, in, x, y);
+        if (VW > 4 && lanes == 3) return few<3, 3, ACCUMULATE>(w, bias, out, in, x, y);
+        if (VW > 4 && lanes == 4) return few<4, 3, ACCUMULATE>(w, bias, out, in, x, y);
+      }
+      for (int o = 0; o < out; o += TILE)
+        panel<NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
+                              out - o < TILE ? out - o : TILE, in, x, y + int64_t(o) * W);
     }
     template <class Fn>
     static INLINE void each(int units, Fn fn) {
@@ -313,7 +352,7 @@ struct Scan {
     static constexpr bool ONE = true;
     static int pad(int n) { return up(n, VW); }
     template <bool ACCUMULATE>
-    static NOINLINE void affine(const Matrix& m, const T* packed, const T* x, T* y) {
+    static NOINLINE void affine(const Matrix& m, const T* packed, int, const T* x, T* y) {
       const T* w = packed + m.stream_panels;
       const T* bias = m.bias >= 0 ? packed + m.stream_bias : nullptr;
       const int first = m.in_split, second = m.in - first;
@@ -549,6 +588,7 @@ struct Scan {
     const T* input_decay;  // weights, then biases
     Layout<P> l;
     T* work;               // slopes of the stages, and other scratch
+    int lanes = P::W;      // that there are; the others are padding
   };
 
   // --- forward --------------------------------------------------------------------------------------
@@ -559,7 +599,7 @@ struct Scan {
     for (int l = 0; l < shape.layers; ++l) {
       const Matrix& m = c.map.m[first + l];
       const bool last = l == shape.layers - 1;
-      P::template affine<false>(m, c.packed, x, last ? out : z);
+      P::template affine<false>(m, c.packed, c.lanes, x, last ? out : z);
       if (last) break;
       T* value = kept + int64_t(n.value[l]) * P::W;
       activate<P>(shape.activation, shape.sizes[l + 1], z, value,
@@ -618,7 +658,7 @@ struct Scan {
       }
       copy<P>(d.C, f.mask, u + int64_t(d.C) * W);
       copy<P>(d.ages, f.age, u + int64_t(2 * d.C) * W);
-      P::template affine<false>(c.map.m[M_IN], c.packed, u, gate);
+      P::template affine<false>(c.map.m[M_IN], c.packed, c.lanes, u, gate);
     }
 
     // Decay and flow.
@@ -626,8 +666,8 @@ struct Scan {
     T* end = at(l.end);
     const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
     if (d.F) {
-      P::template affine<false>(c.map.m[M_DECAY], c.packed, f.start, start);
-      P::template affine<false>(c.map.m[M_DECAY], c.packed, f.end, end);
+      P::template affine<false>(c.map.m[M_DECAY], c.packed, c.lanes, f.start, start);
+      P::template affine<false>(c.map.m[M_DECAY], c.packed, c.lanes, f.end, end);
       P::each(d.H, [&](int64_t i, int lane) {
         const V alive = load<T>(f.alive + lane);
         V first = load<T>(start + i) * alive, last = load<T>(end + i) * alive;
@@ -684,7 +724,7 @@ struct Scan {
       P::each(d.A, [&](int64_t i, int) {
         store<T>(e + i, load<T>(f.mask + i) * (load<T>(f.values + i) - load<T>(state + i)));
       });
-      P::template affine<true>(c.map.m[M_INNOV], c.packed, e, gate);
+      P::template affine<true>(c.map.m[M_INNOV], c.packed, c.lanes, e, gate);
       P::each(d.A, [&](int64_t i, int) {
         const V m = load<T>(f.mask + i);
         store<T>(state + i, m * load<T>(f.values + i) + (1 - m) * load<T>(state + i));
@@ -746,7 +786,7 @@ struct Scan {
       return;
     }
     if (s.cell != CELL_GRU) {
-      P::template affine<true>(c.map.m[M_REC], c.packed, h, gate);
+      P::template affine<true>(c.map.m[M_REC], c.packed, c.lanes, h, gate);
       if (s.cell == CELL_ELMAN) {  // equation 6
         P::each(d.H, [&](int64_t i, int lane) {
           const V on = load<T>(f.update + lane), fresh = tanh_(load<T>(gate + i));
@@ -771,7 +811,7 @@ struct Scan {
       return;
     }
     // equations 20-23, and 29-32 with the gates of GRU-D
-    P::template affine<true>(c.map.m[M_REC], c.packed, h, gate);
+    P::template affine<true>(c.map.m[M_REC], c.packed, c.lanes, h, gate);
     P::each(d.H, [&](int64_t i, int) {
       const V r = sigmoid_(load<T>(gate + n + i));
       store<T>(gate + i, sigmoid_(load<T>(gate + i)));
@@ -779,13 +819,13 @@ struct Scan {
       if (!s.reset_after) store<T>(held + i, r * load<T>(h + i));
     });
     if (s.reset_after) {
-      P::template affine<false>(c.map.m[M_CAND], c.packed, h, held);
+      P::template affine<false>(c.map.m[M_CAND], c.packed, c.lanes, h, held);
       P::each(d.H, [&](int64_t i, int) {
         T* g = gate + 2 * n + i;
         store<T>(g, fma(load<T>(gate + n + i), load<T>(held + i), load<T>(g)));
       });
     } else {
-      P::template affine<true>(c.map.m[M_CAND], c.packed, held, gate + 2 * n);
+      P::template affine<true>(c.map.m[M_CAND], c.packed, c.lanes, held, gate + 2 * n);
     }
     (void)hidden;
     P::each(d.H, [&](int64_t i, int lane) {
@@ -855,9 +895,9 @@ struct Scan {
   }
 
   template <class P>
-  static Context<P> context(const Job<T>& job, const Map& map, T* work) {
+  static Context<P> context(const Job<T>& job, const Block& b, const Map& map, T* work) {
     return Context<P>{*job.spec, map, job.packed, job.packed + map.packed_vectors,
-                      layout<P>(*job.spec, map.d, job.max_steps), work};
+                      layout<P>(*job.spec, map.d, job.max_steps), work, b.lanes};
   }
 
   template <class P>
@@ -868,7 +908,7 @@ struct Scan {
     T* lanes = state + int64_t(d.S) * P::W;
     T* work = lanes + facts_size(d, P::W);
     T* own = work + work_size<P>(*job.spec);
-    const Context<P> c = context<P>(job, p, work);
+    const Context<P> c = context<P>(job, b, p, work);
     Facts<P> f = facts<P>(d, lanes);
     const int64_t row_size = int64_t(c.l.size) * P::W;
     first_state<P>(job, b, state);

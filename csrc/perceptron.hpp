@@ -99,7 +99,7 @@ static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratc
     evaluate_backward<P>(k, shape, M_FIELD, kept, tape, tape + int64_t(in) * P::W, to_layers, to_x);
     if (job.to_x) give_rows<P>(to_x, in, lanes, job.to_x + first * in, in);
     if ((block - begin) % PERCEPTRON_GROUP == PERCEPTRON_GROUP - 1 || block + 1 == end)
-      flush(p, pairs, P::W, sums, xt);
+      flush(p, pairs, P::W, P::W, sums, xt);
   }
 }
 

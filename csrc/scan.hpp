@@ -8,7 +8,7 @@ namespace offbeat {
 
 constexpr int MAX_LAYERS = 16;
 constexpr int MAX_STAGES = 8;
-constexpr int MAX_GROUP = 16;
+constexpr int MAX_GROUP = 128;
 
 enum Cell { CELL_NONE, CELL_SET, CELL_ELMAN, CELL_LSTM, CELL_GRU };
 enum Activation { TANH, SILU };

@@ -53,6 +53,20 @@ INLINE VF fma(VF a, VF b, VF c) { return a * b + c; }
 INLINE VD fma(VD a, VD b, VD c) { return a * b + c; }
 #endif
 
+// Four floats, for what is too narrow for a vector.
+typedef float F4 __attribute__((vector_size(16), may_alias));
+typedef float U4 __attribute__((vector_size(16), aligned(4), may_alias));
+INLINE F4 load_four(const float* p) { return *reinterpret_cast<const U4*>(p); }
+#if defined(__FMA__)
+INLINE F4 fma_four(F4 a, F4 b, F4 c) { return (F4)_mm_fmadd_ps((__m128)a, (__m128)b, (__m128)c); }
+#elif defined(__aarch64__)
+INLINE F4 fma_four(F4 a, F4 b, F4 c) {
+  return (F4)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
+}
+#else
+INLINE F4 fma_four(F4 a, F4 b, F4 c) { return a * b + c; }
+#endif
+
 // NaN stays NaN: where one operand is, the processor's minimum and maximum give the second one.
 #if defined(__AVX512F__) && VECTOR_BYTES == 64
 INLINE VF at_most(VF x, float b) { return (VF)_mm512_min_ps((__m512)broadcast(b), (__m512)x); }
