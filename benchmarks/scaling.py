@@ -78,17 +78,20 @@ def in_turn(steps: dict[Any, Callable[[], None]], repeats: int) -> dict[Any, flo
     return {key: statistics.median(each) for key, each in times.items()}
 
 
-def with_limit(step: Callable[[], None], limit: int) -> Callable[[], None]:
-    """The same step under another limit of the memory that a forward pass may keep."""
+def under(step: Callable[[], None], **settings: int) -> Callable[[], None]:
+    """The same step under other settings of the fused body: `TAPE_LIMIT`, `ROWS_AT_ONCE`."""
 
-    def limited() -> None:
-        kept, fused.TAPE_LIMIT = fused.TAPE_LIMIT, limit
+    def changed() -> None:
+        kept = {name: getattr(fused, name) for name in settings}
         try:
+            for name, value in settings.items():
+                setattr(fused, name, value)
             step()
         finally:
-            fused.TAPE_LIMIT = kept
+            for name, value in kept.items():
+                setattr(fused, name, value)
 
-    return limited
+    return changed
 
 
 def main() -> None:
@@ -124,13 +127,19 @@ def main() -> None:
     step = point(options.model)
     times = in_turn(
         {
-            "stored": with_limit(step, 2**60),
-            "computed again": with_limit(step, 0),
+            "stored": under(step, TAPE_LIMIT=2**60),
+            "computed again": under(step, TAPE_LIMIT=0),
         },
         options.repeats,
     )
     found["inner activations"] = times
     print(f"inner activations: {times}")
+    # At the end: all products of activations and their gradients in one go, after all rows.
+    ways = {f"every {n} rows": under(step, ROWS_AT_ONCE=n) for n in (1, 2, 4, 8, 16, 32)}
+    ways["at the end"] = under(step, ROWS_AT_ONCE=BASE["rows"])
+    times = in_turn(ways, options.repeats)
+    found["weight gradients added"] = times
+    print(f"weight gradients added: {times}")
     write(options.json, {"machine": machine(), "options": vars(options), "sweeps": found})
 
 

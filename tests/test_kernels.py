@@ -231,6 +231,42 @@ def test_batch_mates_padding_and_place_change_no_bit_of_a_trajectory(name: str, 
 @needs_fused
 @bodies
 @pytest.mark.parametrize("name", list(BITS))
+def test_batches_of_any_width_have_the_same_bits(name: str, body: str) -> None:
+    case = problem(seed=7, batch=21, rows=5, channels=4, hidden=7, **BITS[name])
+    with torch.no_grad():
+        whole = fused.scan(*case[:4], body)
+        for n in range(1, 21):
+            rows = cut(case.rows, slice(n), slice(None))
+            part = fused.scan(case.spec, case.weights, rows, case.state[:n], body)
+            for got, expected in zip(part, whole, strict=True):
+                assert torch.equal(got, expected[:n]), n
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("batch", [1, 2, 3, 4, 5, 17, 18, 19, 20, 21])
+def test_narrow_blocks_have_the_gradients_of_the_reference(batch: int, body: str) -> None:
+    for name in BITS:
+        case = problem(seed=9, batch=batch, rows=6, channels=4, hidden=9, **BITS[name])
+        agree(case, body, strict=False)
+
+
+@needs_fused
+@bodies
+def test_when_gradients_of_weights_are_added_changes_no_bit(
+    body: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = problem(seed=5, batch=21, rows=40, channels=4, hidden=7, **BITS["bounded steps"])
+    expected = run(lambda *a: fused.scan(*a, body), case)
+    for rows in (1, 3, 40):
+        monkeypatch.setattr(fused, "ROWS_AT_ONCE", rows)
+        for key, value in run(lambda *a: fused.scan(*a, body), case).items():
+            assert torch.equal(value, expected[key]), (rows, key)
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("name", list(BITS))
 def test_row_by_row_gives_the_bits_of_the_whole_sequence(name: str, body: str) -> None:
     case = problem(seed=8, batch=19, rows=11, channels=4, hidden=7, **BITS[name])
     spec, weights, rows, state, _ = case

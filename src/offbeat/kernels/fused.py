@@ -36,6 +36,11 @@ TAPE_LIMIT = 256 * 2**20
 (`state_size` floats per row, twice), and the backward pass computes the rest again, a few rows at a
 time (`benchmarks/scaling.py` says what that costs)."""
 
+ROWS_AT_ONCE = 0
+"""Rows whose gradients of weights are added up in one go; more of them wait in memory. 0: eight
+evaluations, whichever rows those are (`benchmarks/scaling.py` says what others cost). It changes no
+bit: each sum has its order."""
+
 _CELLS = {"none": 0, "set": 1, "elman": 2, "lstm": 3, "gru": 4}
 _ACTIVATIONS = {"tanh": 0, "silu": 1}
 _DECAY_ROWS = {"continuous": 0, "every_row": 1, "observed_rows": 2}
@@ -238,6 +243,7 @@ class _Scan(Function):
             _array(to_packed),
             _array(to_state),
             ctx.threads,
+            ROWS_AT_ONCE,
         )
         return None, None, None, None, to_packed, to_state
 
