@@ -406,13 +406,14 @@ static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
   const Dims& d = p.d;
   const int64_t per_row = tape_row(s, max_steps, 2) + facts_size(d, P::W) +
                           int64_t(slots(s, d, max_steps).size) * P::W;
-  return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W * 2 +
+  return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W +
          int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * s.stages) * P::W +
          int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
 }
 
 template <class P>
-static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratch) {
+static void block_backward(const Job<T>& job, const Block& b, int begin, int end, T* g, T* sums,
+                           T* scratch) {
   const Spec& s = *job.spec;
   const Map p = map(s);
   const Dims& d = p.d;
@@ -424,7 +425,6 @@ static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratc
     return here;
   };
   const int64_t W = P::W;
-  T* g = take(d.S * W);
   T* state = take(d.S * W);
   const Context<P> c = context<P>(job, b, p, take(work_size<P>(s)));
   const int64_t row_size = int64_t(c.l.size) * W, slot_size = int64_t(places.size) * W;
@@ -439,14 +439,17 @@ static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratc
   T* gradients = take(slot_size * job.group);
   T* own = job.tape ? nullptr : take(row_size * job.group);
 
-  zero(g, d.S * W);
-  for (int64_t row = job.n_rows - 1; row >= b.rows; --row) {
-    collect<P>(job, b, job.to_after, int(row), d.S, true, g);
-    collect<P>(job, b, job.to_before, int(row), d.S, true, g);
+  if (end >= b.rows) {
+    end = b.rows;
+    zero(g, d.S * W);
+    for (int64_t row = job.n_rows - 1; row >= b.rows; --row) {
+      collect<P>(job, b, job.to_after, int(row), d.S, true, g);
+      collect<P>(job, b, job.to_before, int(row), d.S, true, g);
+    }
   }
   Facts<P> f[MAX_GROUP];
-  for (int last = b.rows; last > 0; last -= job.group) {
-    const int first = last > job.group ? last - job.group : 0;
+  for (int last = end; last > begin; last -= job.group) {
+    const int first = last - begin > job.group ? last - job.group : begin;
     if (!job.tape) {
       if (first)
         collect<P>(job, b, job.after, first - 1, d.S, false, state);
@@ -467,22 +470,25 @@ static void block_backward(const Job<T>& job, const Block& b, T* sums, T* scratc
     }
     flush(p, pairs, P::W, b.lanes, sums, xt);
   }
-  if (job.to_state) {
+  if (job.to_state && begin == 0) {
     Grid<T> grid{job.to_state, d.S, 0};
     scatter<P>(job, b, grid, 0, g, d.S);
   }
 }
 
-static void backward(const Job<T>& job, int slot, T* scratch) {
+static int64_t carried_size(const Spec& s) { return int64_t(dims(s).S) * 2 * VW; }
+
+static void backward(const Job<T>& job, int slot, int begin, int end, T* scratch) {
   const int64_t size = sums_size(*job.spec);
   T* sums = job.sums + slot * size;
-  zero(sums, size);
+  if (end >= job.blocks[job.slots[slot].first].rows) zero(sums, size);
   for (int i = job.slots[slot].first; i < job.slots[slot].last; ++i) {
     const Block& b = job.blocks[i];
+    T* g = job.carried + i * carried_size(*job.spec);
     if (b.vectors == 2)
-      block_backward<Many<2>>(job, b, sums, scratch);
+      block_backward<Many<2>>(job, b, begin, end, g, sums, scratch);
     else
-      block_backward<Many<1>>(job, b, sums, scratch);
+      block_backward<Many<1>>(job, b, begin, end, g, sums, scratch);
   }
 }
 

@@ -901,7 +901,7 @@ struct Scan {
   }
 
   template <class P>
-  static void block_forward(const Job<T>& job, const Block& b, T* scratch) {
+  static void block_forward(const Job<T>& job, const Block& b, int begin, int end, T* scratch) {
     const Map p = map(*job.spec);
     const Dims& d = p.d;
     T* state = scratch;
@@ -911,8 +911,12 @@ struct Scan {
     const Context<P> c = context<P>(job, b, p, work);
     Facts<P> f = facts<P>(d, lanes);
     const int64_t row_size = int64_t(c.l.size) * P::W;
-    first_state<P>(job, b, state);
-    for (int row = 0; row < job.n_rows; ++row) {
+    if (begin)
+      collect<P>(job, b, job.after, begin - 1, d.S, false, state);
+    else
+      first_state<P>(job, b, state);
+    if (end >= b.rows) end = int(job.n_rows);
+    for (int row = begin; row < end; ++row) {
       if (row < b.rows) {
         T* tape = job.tape ? job.tape + b.tape + row * row_size : own;
         gather<P>(job, d, b, row, f, 2);
@@ -925,12 +929,12 @@ struct Scan {
     }
   }
 
-  static void forward(const Job<T>& job, int block, T* scratch) {
+  static void forward(const Job<T>& job, int block, int begin, int end, T* scratch) {
     const Block& b = job.blocks[block];
     if (b.vectors == 2)
-      block_forward<Many<2>>(job, b, scratch);
+      block_forward<Many<2>>(job, b, begin, end, scratch);
     else
-      block_forward<Many<1>>(job, b, scratch);
+      block_forward<Many<1>>(job, b, begin, end, scratch);
   }
 
 #include "backward.hpp"

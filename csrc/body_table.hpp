@@ -12,6 +12,7 @@ constexpr Body<T> table() {
   t.backward_scratch = S::backward_scratch;
   t.sums_size = S::sums_size;
   t.forward = S::forward;
+  t.carried_size = S::carried_size;
   t.backward = S::backward;
   t.reduce = S::reduce;
   t.perceptron_packed_size = S::perceptron_packed_size;

@@ -10,6 +10,7 @@
 #include <atomic>
 #include <cmath>
 #include <memory>
+#include <mutex>
 #include <new>
 #include <numeric>
 #include <stdexcept>
@@ -110,6 +111,53 @@ void spread(int64_t tasks, int threads, int64_t scratch, const Work& work) {
   }
   run(0);
   for (std::thread& t : others) t.join();
+}
+
+// A walk over the rows of a block, or of a slot of blocks.
+struct Walk {
+  int rows, cost;  // of a row
+};
+
+// Calls work(walk, begin, end, scratch) until each walk has got from 0 to its last row. With several
+// threads it is done in stretches, the walk with most before it first, so that all end together
+// although the blocks may not be a multiple of the threads. Which thread takes which stretch does
+// not matter to the result.
+template <class T, class Work>
+void walk(const std::vector<Walk>& walks, int stretch, int threads, int64_t scratch,
+          const Work& work) {
+  const int64_t n = int64_t(walks.size());
+  if (threads < 2 || n < 2 || n > 8 * threads) {
+    spread<T>(n, threads, scratch,
+              [&](int64_t i, T* memory) { work(int(i), 0, walks[i].rows, memory); });
+    return;
+  }
+  std::mutex mutex;
+  std::vector<int> done(n, 0);
+  std::vector<bool> taken(n, false);
+  spread<T>(std::min<int64_t>(threads, n), threads, scratch, [&](int64_t, T* memory) {
+    int mine = -1, begin = 0, end = 0;
+    for (;;) {
+      {
+        std::lock_guard<std::mutex> lock(mutex);
+        if (mine >= 0) {
+          done[mine] = end;
+          taken[mine] = end >= walks[mine].rows;
+        }
+        int64_t most = -1;
+        mine = -1;
+        for (int64_t i = 0; i < n; ++i) {
+          const int64_t left = int64_t(walks[i].rows - done[i]) * walks[i].cost;
+          if (!taken[i] && left > most) most = left, mine = int(i);
+        }
+        // What is left is in the hands of others, who go on until it is done.
+        if (mine < 0) return;
+        taken[mine] = true;
+        begin = done[mine];
+        end = std::min(walks[mine].rows, begin + stretch);
+      }
+      work(mine, begin, end, memory);
+    }
+  });
 }
 
 // --- arguments --------------------------------------------------------------------------------------
@@ -293,6 +341,12 @@ struct Call {
     job.order = order.data(), job.length = length.data();
     job.blocks = blocks.data(), job.slots = slots.data();
   }
+
+  // Rows between two looks at who is behind: a sixteenth of all, in whole groups.
+  int stretch() const {
+    const int rows = std::max(1, int(job.n_rows) / 16);
+    return (rows + job.group - 1) / job.group * job.group;
+  }
 };
 
 template <class T>
@@ -397,8 +451,12 @@ void scan_forward(const Spec& s, const Bodies& named, const Const<T>& weights, c
   nb::gil_scoped_release unlocked;
   const auto weight = packed<T>(s, body, weights);
   job.packed = weight->get();
-  spread<T>(int64_t(call.blocks.size()), threads, body.forward_scratch(s, job.max_steps),
-            [&](int64_t block, T* scratch) { body.forward(job, int(block), scratch); });
+  std::vector<Walk> walks;
+  for (const Block& b : call.blocks) walks.push_back({b.rows, b.vectors});
+  walk<T>(walks, call.stretch(), threads, body.forward_scratch(s, job.max_steps),
+          [&](int block, int begin, int end, T* scratch) {
+            body.forward(job, block, begin, end, scratch);
+          });
 }
 
 template <class T>
@@ -428,9 +486,20 @@ void scan_backward(const Spec& s, const Bodies& named, const Const<T>& weights, 
   job.packed = weight->get();
   const Buffer<T> sums(int64_t(call.slots.size()) * body.sums_size(s));
   job.sums = sums.get();
-  spread<T>(int64_t(call.slots.size()), threads,
-            body.backward_scratch(s, job.max_steps, job.group),
-            [&](int64_t slot, T* scratch) { body.backward(job, int(slot), scratch); });
+  const Buffer<T> carried(int64_t(call.blocks.size()) * body.carried_size(s));
+  job.carried = carried.get();
+  std::vector<Walk> walks;
+  for (const Slot& slot : call.slots) {
+    const Block& b = call.blocks[slot.first];
+    walks.push_back({b.rows, b.vectors});
+  }
+  const bool whole = call.slots.size() < call.blocks.size();
+  walk<T>(walks, whole ? int(job.n_rows) : call.stretch(), threads,
+          body.backward_scratch(s, job.max_steps, job.group),
+          [&](int slot, int begin, int end, T* scratch) {
+            const int rows = walks[slot].rows;
+            body.backward(job, slot, rows - end, rows - begin, scratch);
+          });
   body.reduce(s, sums.get(), int(call.slots.size()), flat);
 }
 

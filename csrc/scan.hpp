@@ -80,6 +80,7 @@ struct Job {
   Grid<T> to_before, to_after;      // backward
   T* to_state = nullptr;            // (batch, state)
   T* tape = nullptr;                // null: the backward pass computes it again
+  T* carried = nullptr;             // backward: of each block, between two stretches of its rows
   T* sums = nullptr;                // of all slots
   int max_steps = 1;                // over all gaps
   int group = 4;                    // rows whose weight gradients are added in one go
@@ -122,8 +123,12 @@ struct Body {
   int64_t (*forward_scratch)(const Spec&, int max_steps);
   int64_t (*backward_scratch)(const Spec&, int max_steps, int group);
   int64_t (*sums_size)(const Spec&);
-  void (*forward)(const Job<T>&, int block, T* scratch);
-  void (*backward)(const Job<T>&, int slot, T* scratch);
+  // Rows from `begin` on and before `end`, in the order of time; the walk may stop and go on
+  // anywhere. `end` at the block's last row includes the padding behind it.
+  void (*forward)(const Job<T>&, int block, int begin, int end, T* scratch);
+  int64_t (*carried_size)(const Spec&);  // of a block
+  // The same rows backwards; a slot of several blocks must be walked in one go.
+  void (*backward)(const Job<T>&, int slot, int begin, int end, T* scratch);
   void (*reduce)(const Spec&, const T* sums, int slots, T* flat);
 
   int64_t (*perceptron_packed_size)(const Perceptron&);
