@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import textwrap
@@ -71,6 +72,10 @@ class TestCsvOfOtherPrograms:
         dataset = read(text_file("time,closed\n0,True\n1,\n2,False\n"))
         assert same(dataset[0].values[:, 0], [1, NAN, 0])
 
+    def test_names_the_line_of_what_is_no_boolean(self, text_file):
+        path = text_file("time,closed\n" + "0,True\n" * 1500 + "1,ajar\n")
+        refused(path, "has 'ajar' in line 1502, column 'closed', expected one of true, false")
+
     def test_may_have_a_channel_that_is_never_known(self, text_file):
         dataset = read(text_file("time,x,broken\n0,1,\n1,2,NaN\n"))
         assert np.isnan(dataset[0].values[:, 1]).all()
@@ -109,6 +114,80 @@ class TestCsvOfOtherPrograms:
         first, second = read(text_file(f"time_ms,episode,x,y,z\n{rows}"))
         assert first.values.tobytes("C") == values[::2].tobytes("C")
         assert second.values.tobytes("C") == values[1::2].tobytes("C")
+
+
+START = 1_795_554_000  # 2026-11-24T21:00:00Z, seconds since 1970
+
+
+class TestTimesOfIso8601:
+    @pytest.mark.parametrize("joint", ["T", " "])
+    @pytest.mark.parametrize(
+        ("offset", "ahead"), [("Z", 0), ("", 0), ("+02:00", 2), ("-0330", -3.5), ("+02", 2)]
+    )
+    def test_keep_their_nanoseconds_and_the_clock_at_the_start(
+        self, text_file, joint, offset, ahead
+    ):
+        digits = [".123456789", ".12345679", ".5", ""]
+        rows = "".join(
+            f"{i}, 2026-11-24{joint}21:00:0{second}{digit}{offset}\n"
+            for i, (second, digit) in enumerate(zip([0, 0, 0, 1], digits, strict=True))
+        )
+        dataset = read(text_file(f"x,when\n{rows}"), time_column="when")
+        assert dataset[0].times.tolist() == [0.0, 1e-9, 0.376543211, 0.876543211]
+        start = (START - round(3600 * ahead)) * 10**9 + 123_456_789
+        assert (dataset.meta["time_unit"], dataset.meta["clock_start"]) == ("ns", [start])
+        assert notes_of(dataset) == []
+
+    def test_may_change_their_offset(self, text_file):
+        text = "time,x\n2026-10-25T02:59:59+02:00,1\n2026-10-25T02:00:00+01:00,2\n"
+        assert read(text_file(text))[0].times.tolist() == [0.0, 1.0]
+
+    def test_may_be_days_or_stand_in_quotes_and_their_unit_need_not_be_said(self, text_file):
+        text = 'time,x\n"2026-11-24",1\n2026-11-24 00:01,2\n'
+        for options in ({}, {"time_unit": "s"}):
+            assert read(text_file(text), **options)[0].times.tolist() == [0.0, 60.0]
+
+    def test_are_those_of_parquet(self, text_file, tmp_path):
+        stamps = pa.array([START * 10**9 + 7, START * 10**9 + 12], pa.timestamp("ns", "UTC"))
+        pq.write_table(pa.table({"time": stamps, "x": [1.0, 2.0]}), tmp_path / "walk.parquet")
+        text = "time,x\n2026-11-24T21:00:00.000000007Z,1\n2026-11-24T22:00:00.000000012+0100,2\n"
+        one, other = read(text_file(text)), read(tmp_path / "walk.parquet")
+        assert one.fingerprint() == other.fingerprint()
+        assert one.meta["clock_start"] == other.meta["clock_start"]
+
+    def test_may_stand_in_episodes_and_in_the_long_form(self, text_file):
+        text = (
+            "episode,time,channel,value\na,2026-11-24 21:00,x,1\nb,2026-11-24 21:00:01,y,2\n"
+            "b,2026-11-24 21:00:01.25,x,3\n"
+        )
+        first, second = dataset = read(text_file(text))
+        assert same(first.values, [[1, NAN]])
+        assert second.times.tolist() == [0.0, 0.25]
+        assert dataset.meta["clock_start"] == [START * 10**9, (START + 1) * 10**9]
+
+    @pytest.mark.parametrize(
+        ("first", "second", "message"),
+        [
+            ("2026-11-24", "2026-11-24T21:00Z", "ISO 8601 without an offset from UTC, as '2026-11"),
+            ("2026-11-24T21:00Z", "2026-11-24T21:01", "ISO 8601 with an offset from UTC, as"),
+            ("2026-11-24", "5", "expected a time of ISO 8601 without"),
+            ("5", "2026-11-24", "expected a number, or in all rows a time of ISO 8601, such as"),
+            ("2026-11-24", "2026-11-31", "expected a time"),
+            ("2026-11-24", "1676-11-24", "the years 1678 to 2261"),
+            ("2026-11-24", "2026-11-24 21:00:60", "expected a time"),
+            ("2026-11-24", "2026-11-24 21:00:00.0123456789", "up to nine digits"),
+            ("2026-11-24T21:00Z", "2026-11-24T21:00+24:00", "expected a time"),
+        ],
+    )
+    def test_that_are_malformed_or_mixed_are_named_by_line_and_column(
+        self, text_file, first, second, message
+    ):
+        path = text_file(f"x,time\n1,{first}\n2,{first}\n3,{second}\n")
+        refused(path, f"walk.csv has '{re.escape(second)}' in line 4, column 'time', .*{message}")
+
+    def test_that_are_missing_are_named_by_their_line(self, text_file):
+        for empty in ("", "NaN", " "):
+            refused(text_file(f"time,x\n2026-11-24,1\n{empty},2\n"), "no time in line 3, column")
 
 
 class TestTheLongForm:

@@ -12,6 +12,7 @@ from typing import Any
 from offbeat.data.clock import NANOSECONDS_PER, state_time_unit
 from offbeat.data.readers.batches import NullCellError, gather, line_error
 from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
+from offbeat.data.readers.stamps import expected_after, form_of, with_stamps
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, InputError
@@ -43,7 +44,9 @@ def read_csv(
 
     A first column without a name that counts the rows, as pandas writes it, is left out. A unit in
     brackets after a name, as in `speed [m/s]`, is the channel's unit and no part of its name.
-    Times keep every digit down to the nanosecond. The file is read a mebibyte at a time.
+    Times keep every digit down to the nanosecond, as numbers and as texts of ISO 8601, whose clock
+    counts nanoseconds since 1970 (in UTC where they say their offset). The file is read a mebibyte
+    at a time.
 
     Args:
         path: the file, in UTF-8.
@@ -54,7 +57,7 @@ def read_csv(
         channels: the columns to read as channels (in the long form: their names in the column of
             channels), in the order wanted; by default all.
         time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's name says, else
-            found by the numbers, which is said aloud, else `s`.
+            found by the numbers, which is said aloud, else `s`. Times of ISO 8601 know theirs.
         units: unit of a channel by its name.
         delimiter: the character between two cells; by default a comma, or the semicolon or tab
             that the header has instead.
@@ -92,8 +95,11 @@ def read_csv(
         channel_column=channel_column,
         value_column=value_column,
     )
-    numbers = [float(cell) for cell in sample[columns.time] if _is_number(cell)]
-    unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
+    unit = "ns"
+    notes: tuple[str, ...] = ()
+    if form_of(_first_time(sample, columns)) is None:
+        numbers = [float(cell) for cell in sample[columns.time] if _is_number(cell)]
+        unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
     if not header[0]:
         notes = (*notes, "the first column has no name and counts the rows; it is left out")
     table, counted_in = file.columns(header, sample, columns, unit)
@@ -160,18 +166,20 @@ class _CsvFile:
         clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
         if not all(cell.lstrip("+-").isdecimal() for cell in sample[columns.time]):
             clocks = clocks[1:]
+        form = form_of(_first_time(sample, columns))
+        if form is not None:
+            clocks = [pa.string()]
         capacity = self._count_lines()
         for clock in clocks:
+            batches = self._batches(header, columns, types | {columns.time: clock})
+            if form is not None:
+                batches = with_stamps(batches, columns.time, form, MISSING)
             try:
-                table = gather(
-                    self._batches(header, columns, types | {columns.time: clock}),
-                    columns,
-                    capacity,
-                )
+                table = gather(batches, columns, capacity)
             except (pa.ArrowException, OverflowError) as error:
                 at = f"In CSV column #{header.index(columns.time)}:"
                 if clock is clocks[-1] or (at not in str(error) and clock is not clocks[0]):
-                    self._explain(header, columns)
+                    self._explain(header, columns, sample)
                     raise line_error(self.path, error) from None
                 continue
             except NullCellError as error:
@@ -222,9 +230,11 @@ class _CsvFile:
             f"must say which {what} it belongs to"
         )
 
-    def _explain(self, header: list[str], columns: Columns) -> None:
+    def _explain(self, header: list[str], columns: Columns, sample: dict[str, list[str]]) -> None:
         """Raises an error that names the line and column at fault, if one can be found."""
-        numeric = [columns.time, *columns.channels]
+        first = _first_time(sample, columns)
+        form = form_of(first)
+        truths = [name for name in columns.channels if _holds_booleans(sample[name])]
         for line, cells in self._lines():
             if len(cells) != len(header):
                 raise FileFormatError(
@@ -232,10 +242,21 @@ class _CsvFile:
                     f"one per column: {listed(header)}"
                 )
             for name, cell in zip(header, cells, strict=True):
-                if line > 1 and name in numeric and cell not in MISSING and not _is_number(cell):
+                if line == 1 or name not in columns.read or cell.strip() in MISSING:
+                    continue
+                if name == columns.time:
+                    fits = _is_number(cell) if form is None else form_of(cell.strip()) == form
+                    expected = "" if fits else expected_after(first)
+                elif name in truths:
+                    expected = "" if cell in _BOOLEANS else f"one of {', '.join(_BOOLEANS)}"
+                elif name in columns.channels and not _is_number(cell):
+                    expected = "a number; choose the columns that are channels with channels="
+                else:
+                    continue
+                if expected:
                     raise FileFormatError(
-                        f"{self.path} has {cell!r} in line {line}, column {name!r}, expected a "
-                        "number; choose the columns that are channels with channels="
+                        f"{self.path} has {cell!r} in line {line}, column {name!r}, expected "
+                        f"{expected}"
                     )
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
@@ -252,12 +273,21 @@ class _CsvFile:
             ) from None
 
 
+def _first_time(sample: dict[str, list[str]], columns: Columns) -> str:
+    """The first cell of the clock that says something, or nothing."""
+    return next((cell for cell in sample[columns.time] if cell not in MISSING), "")
+
+
 def _type_of(cells: list[str]) -> Any:
     """The Arrow type of a channel by its first cells: booleans by name, else numbers."""
     import pyarrow as pa
 
+    return pa.bool_() if _holds_booleans(cells) else pa.float64()
+
+
+def _holds_booleans(cells: list[str]) -> bool:
     known = [cell for cell in cells if cell not in MISSING]
-    return pa.bool_() if known and all(c in _BOOLEANS for c in known) else pa.float64()
+    return bool(known) and all(cell in _BOOLEANS for cell in known)
 
 
 def _is_number(cell: str) -> bool:
