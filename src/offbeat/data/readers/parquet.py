@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from offbeat.data.clock import state_time_unit, time_column_of
-from offbeat.data.readers.batches import NullCellError, gather, line_error
+from offbeat.data.readers.batches import NullCellError, gather_columns, line_error
 from offbeat.data.readers.columns import Columns, listed, recordings
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError
 
 _ROWS = 1 << 16  # in memory at a time, beside the result
-_BUFFER = 1 << 18  # bytes of each column in memory at a time
+_BUFFER = 1 << 18  # bytes of a column as it is stored, in memory at a time
+_THREADS = 4  # columns that are read at once, at most
+_MANY = 1 << 20  # cells that are worth a thread
 _INDEX = "__index_level_0__"  # what pandas calls an index without a name
 
 
@@ -63,8 +66,10 @@ def read_parquet(
 
     path = require_file(path)
     try:
-        # Else a whole row group, which can be all of the file, would lie in memory, too.
-        with pq.ParquetFile(path, pre_buffer=False, buffer_size=_BUFFER) as file:
+        with ExitStack() as opened:
+            # Else a whole row group, which can be all of the file, would lie in memory.
+            bounded = {"pre_buffer": False, "buffer_size": _BUFFER}
+            file = opened.enter_context(pq.ParquetFile(path, **bounded))
             schema = file.schema_arrow
             columns = Columns.of(
                 path,
@@ -79,10 +84,10 @@ def read_parquet(
             _check_types(path, schema, columns)
             if not file.metadata.num_rows:
                 raise FileFormatError(f"{path} has columns and no rows, expected one per time")
-            batches = file.iter_batches(_ROWS, columns=columns.read)
-            first = next(batches)
+            rows = file.metadata.num_rows
+            chunks = functools.partial(_chunks, file)
             widths = {
-                name: _width(path, name, first.column(name))
+                name: _width(path, name, next(chunks(name)))
                 for name in columns.channels
                 if _is_list(schema.field(name).type)
             }
@@ -91,15 +96,14 @@ def read_parquet(
             if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
                 unit = str(kind.unit)
             else:
-                sample = first.column(columns.time).drop_null()
+                sample = next(chunks(columns.time)).drop_null()
                 sample = sample.cast(pa.float64(), safe=False).to_numpy()
                 unit, notes = state_time_unit(time_unit, columns.time, sample, str(path))
-            table = gather(
-                itertools.chain([first], batches),
-                columns,
-                file.metadata.num_rows,
-                widths=widths,
-            )
+            sources = [chunks]
+            while len(sources) < min(_THREADS, pa.cpu_count(), rows * len(columns.read) // _MANY):
+                other = pq.ParquetFile(path, metadata=file.metadata, **bounded)
+                sources.append(functools.partial(_chunks, opened.enter_context(other)))
+            table = gather_columns(sources, columns, rows, widths=widths)
     except NullCellError as error:
         raise FileFormatError(
             f"{path} has an empty cell in row {error.row}, column {error.column!r}, where every "
@@ -112,6 +116,12 @@ def read_parquet(
             f"({str(said).removeprefix(f'{path}: ')}); copy it again"
         ) from None
     return recordings(path, _spread(columns, widths), unit, notes, table)
+
+
+def _chunks(file: Any, name: str) -> Iterator[Any]:
+    """The Arrow arrays of a column, one after the other."""
+    for batch in file.iter_batches(_ROWS, columns=[name], use_threads=False):
+        yield batch.column(name)
 
 
 def _names(schema: Any, time_column: str | None) -> list[str]:
