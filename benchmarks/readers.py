@@ -3,8 +3,8 @@
     python benchmarks/readers.py [--rows 1000000] [--channels 30] [--repeats 3] [--out FILE]
 
 The file is written once, with a clock in nanoseconds and one cell in twenty missing; each way is
-timed in turns, wall and CPU seconds, medians and the least. Beside it stands pyarrow alone, which makes columns
-of its own and no trajectory.
+timed in turns, wall and CPU seconds, medians and the least. Beside it stands pyarrow alone, which
+makes columns of its own and no trajectory.
 """
 
 from __future__ import annotations

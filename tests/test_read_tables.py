@@ -12,8 +12,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from offbeat.data import readers
+from offbeat.data import memory, readers
 from offbeat.data.readers import FOLDER, Reader, read, register
+from offbeat.data.store import save
+from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError
 
 NAN = float("nan")
@@ -464,6 +466,71 @@ class TestReadersOfOthers:
         refused(tmp_path, "is an empty folder")
         (tmp_path / "notes.doc").write_text("x")
         refused(tmp_path, "is a folder of no known format, expected one of: .*euroc")
+
+
+GROUPS_2 = {
+    "meminfo": "MemTotal: 9000 kB\nMemAvailable: 8000 kB\nSwapFree: 0 kB\n",
+    "self/cgroup": "0::/jobs/mine\n",
+    "jobs/mine/memory.max": "max\n",
+    "jobs/mine/memory.current": "1000\n",
+    "jobs/memory.max": "5000000\n",
+    "jobs/memory.current": "4000000\n",
+    "jobs/memory.stat": "anon 7\nactive_file 100\ninactive_file 20\n",
+}
+GROUPS_1 = {
+    "self/cgroup": "2:cpu:/\n5:memory:/box\n0::/\n",
+    "memory/memory.limit_in_bytes": "9000",
+    "memory/memory.usage_in_bytes": "2000",
+    "memory/memory.stat": "active_file 1\ntotal_active_file 500\n",
+}
+
+
+class TestMemory:
+    @pytest.mark.parametrize(
+        ("files", "available"),
+        [
+            ({}, None),
+            ({"meminfo": GROUPS_2["meminfo"]}, 8000 * 1024),
+            (GROUPS_2, 1_000_120),
+            (GROUPS_1, 7500),
+            ({**GROUPS_1, "memory/memory.usage_in_bytes": "99000"}, 0),
+            ({"meminfo": "MemAvailable: much\n", "self/cgroup": "nonsense"}, None),
+        ],
+    )
+    def test_is_what_system_and_control_groups_leave(self, tmp_path, monkeypatch, files, available):
+        monkeypatch.setattr(memory, "_PROC", tmp_path)
+        monkeypatch.setattr(memory, "_GROUPS", tmp_path)
+        for name, text in files.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text)
+        assert memory.available_memory() == available
+
+    def test_that_is_there_is_known_on_linux(self):
+        found = memory.available_memory()
+        assert found is None if not sys.platform.startswith("linux") else found > 0
+
+    def test_that_lacks_is_said_before_a_table_is_read(self, text_file, tmp_path, monkeypatch):
+        text = text_file("time,x,y\n0,1,2\n1,2,3\n2,3,4")
+        columns = {"time": [0.0, 1.0, 2.0], "q": [[1.0, 2.0]] * 3}
+        pq.write_table(pa.table(columns), tmp_path / "walk.parquet")
+        monkeypatch.setattr(memory, "available_memory", lambda: 203)  # 204 are needed
+        for path in (text, tmp_path / "walk.parquet"):
+            refused(path, "holds 3 rows x 2 channels, which need 2.04e-07 GB of memory, and "
+                    "2.03e-07 GB are available; choose channels=, or split the file")  # fmt: skip
+        assert read(text, channels=["y"])[0].rows == 3
+        monkeypatch.setattr(memory, "available_memory", lambda: 204)
+        assert read(text)[0].rows == read(tmp_path / "walk.parquet")[0].rows == 3
+        monkeypatch.setattr(memory, "available_memory", lambda: None)
+        assert read(text)[0].rows == 3
+
+    def test_that_lacks_is_said_of_other_files(self, text_file, tmp_path, monkeypatch):
+        poses = text_file("0 1 2 3 0 0 0 1\n", "walk.tum")
+        np.savez_compressed(tmp_path / "walk.npz", time=np.arange(1000.0), x=np.zeros(1000))
+        save(Dataset([Trajectory([0.0, 1.0], [[1.0], [2.0]])]), tmp_path / "walk.parquet")
+        monkeypatch.setattr(memory, "available_memory", lambda: 40)
+        refused(poses, "holds 16 bytes of text, which need 4.8e-08 GB .*; split the file")
+        refused(tmp_path / "walk.npz", "holds 16[0-9]{3} bytes of arrays")
+        refused(tmp_path / "walk.parquet", "holds 2 rows x 1 channels, .*; split the file")
 
 
 PEAK = """

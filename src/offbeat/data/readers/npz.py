@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.clock import state_time_unit, time_column_of
+from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import LABEL_NAMES, Coder, Columns, Gathered, listed, recordings
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
@@ -55,6 +56,7 @@ def read_npz(
         InputError: an option names an array or a unit that there is not.
     """
     path = require_file(path)
+    _check_size(path)
     arrays = _load(path)
     time = (
         time_column_of(list(arrays))
@@ -118,6 +120,16 @@ def read_npz(
     return recordings(
         path, described, unit, notes, Gathered(clock, coded, None, values.reshape(len(names), -1).T)
     )
+
+
+def _check_size(path: Path) -> None:
+    """Raises an error where the arrays, once unpacked, and the values made of them do not fit."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = sum(member.file_size for member in file.infolist())
+    except (zipfile.BadZipFile, OSError):
+        return  # what is wrong with it is said when it is read
+    require_memory(path, 2 * size, f"{size} bytes of arrays")
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:

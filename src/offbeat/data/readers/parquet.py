@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data.clock import state_time_unit, time_column_of
+from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullCellError, gather_columns, line_error
 from offbeat.data.readers.columns import Columns, listed, recordings
 from offbeat.data.recording import Recording
@@ -99,6 +100,8 @@ def read_parquet(
                 sample = next(chunks(columns.time)).drop_null()
                 sample = sample.cast(pa.float64(), safe=False).to_numpy()
                 unit, notes = state_time_unit(time_unit, columns.time, sample, str(path))
+            width = sum(widths.get(name, 1) for name in columns.channels)
+            require_rows(path, rows, width)
             sources = [chunks]
             while len(sources) < min(_THREADS, pa.cpu_count(), rows * len(columns.read) // _MANY):
                 other = pq.ParquetFile(path, metadata=file.metadata, **bounded)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from offbeat.data.memory import require_memory
 from offbeat.data.readers.batches import gather
 from offbeat.data.readers.columns import Columns, recordings
 from offbeat.data.readers.table import read_csv
@@ -16,6 +17,8 @@ from offbeat.errors import FileFormatError, InputError, one_of
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 """The eight numbers of a line of TUM: seconds, metres, and a quaternion with its scalar last."""
+
+_COPIES = 3  # of a text in memory, while it is read
 
 _TUM = Columns("timestamp", None, TUM_COLUMNS[1:], TUM_COLUMNS[1:], ("m",) * 3 + ("",) * 4)
 
@@ -40,6 +43,8 @@ def read_tum(path: str | Path) -> list[Recording]:
     import pyarrow.csv as pv
 
     path = require_file(path)
+    size = path.stat().st_size
+    require_memory(path, _COPIES * size, f"{size} bytes of text")
     text = path.read_bytes().removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
     text = re.sub(rb"(?m)^[ \t]*(?:#.*)?\n?", b"", text)
     text = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)[ \t]+$", b"", text))

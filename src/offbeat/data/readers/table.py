@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data.clock import NANOSECONDS_PER, state_time_unit
+from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullCellError, gather, line_error
 from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
 from offbeat.data.readers.stamps import expected_after, form_of, with_stamps
@@ -169,13 +170,14 @@ class _CsvFile:
         form = form_of(_first_time(sample, columns))
         if form is not None:
             clocks = [pa.string()]
-        capacity = self._count_lines()
+        lines = self._count_lines()
+        require_rows(self.path, lines - 1, len(columns.channels))
         for clock in clocks:
             batches = self._batches(header, columns, types | {columns.time: clock})
             if form is not None:
                 batches = with_stamps(batches, columns.time, form, MISSING)
             try:
-                table = gather(batches, columns, capacity)
+                table = gather(batches, columns, lines)
             except (pa.ArrowException, OverflowError) as error:
                 at = f"In CSV column #{header.index(columns.time)}:"
                 if clock is clocks[-1] or (at not in str(error) and clock is not clocks[0]):
@@ -206,13 +208,15 @@ class _CsvFile:
             yield from reader
 
     def _count_lines(self) -> int:
-        """At least the number of rows."""
+        """Of the file, header included: at least the number of rows."""
         ends = returns = 0
+        last = b""
         with self.path.open("rb") as file:
             while block := file.read(_BLOCK):
                 ends += block.count(b"\n")
                 returns += block.count(b"\r") if not ends else 0
-        return max(ends, returns) + 1
+                last = block[-1:]
+        return max(ends, returns) + (last not in b"\r\n")
 
     def line_of(self, row: int) -> int:
         """The line in which a row of data ends, counted from 1; the header is line 1."""
