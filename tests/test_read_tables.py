@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import zipfile
 
 import numpy as np
 import pyarrow as pa
@@ -52,6 +53,35 @@ class TestCsvOfOtherPrograms:
             assert dataset.names == ("x",)
             assert "the first column has no name and counts the rows" in notes_of(dataset)[0]
         refused(text_file(",time,x\n5,0,1\n5,1,2\n"), "no name for column 0")
+
+    def test_may_end_all_lines_in_a_delimiter(self, text_file):
+        dataset = read(text_file(",time,x,\n0,0,1,\n1,1,2,\n"))
+        assert (dataset.names, dataset[0].values.tolist()) == (("x",), [[1.0], [2.0]])
+        assert "the last column has no name and is empty; it is left out" in notes_of(dataset)
+        refused(text_file("time,x,\n0,1,\n1,2,3\n"), "no name for column 2")
+
+    @pytest.mark.parametrize("time", ["time", "time_ms"])
+    def test_may_have_a_comma_for_the_decimal_point(self, text_file, time):
+        text = f"{time};x;y\n1000;-1,25;3\n1500,5; 2,5e1;NaN\n"
+        dataset = read(text_file(text), decimal=",")
+        assert dataset[0].times.tolist() == [0.0, 500.5 if time == "time" else 0.5005]
+        assert same(dataset[0].values, [[-1.25, 3], [25, NAN]])
+        refused(text_file(text), "has '-1,25' in line 2, .*say so with decimal=','")
+        refused(text_file("time;x\n0;1\n1,5;2\n"), "has '1,5' in line 3, .* decimal=','")
+        refused(text_file("time;x\n0;1.234,5\n"), "has '1.234,5' in line 2", decimal=",")
+        refused(text_file(text), "unknown decimal", InputError, decimal=";")
+
+    def test_may_pad_its_cells(self, text_file):
+        dataset = read(text_file("time , x , y\n 0 ,   , 1\n 1 , 2 , NaN\n"))
+        assert same(dataset[0].values, [[NAN, 1], [2, NAN]])
+        refused(text_file("time,x\n0,1\n1, NA\n"), "has ' NA' in line 3, column 'x'")
+
+    @pytest.mark.parametrize("text", ["time,x", "time,x\n", "time,x\r\n"])
+    def test_of_a_header_alone_is_said_to_have_no_rows(self, text_file, text):
+        refused(text_file(text), "has a header and no rows")
+
+    def test_with_digits_of_another_script_is_named_by_its_line(self, text_file):
+        refused(text_file("time,x\n0,1\n1,\uff11\n"), "has '\uff11' in line 3, column 'x'")
 
     @pytest.mark.parametrize("delimiter", [";", "\t"])
     def test_may_have_another_delimiter_that_is_found(self, text_file, delimiter):
@@ -261,6 +291,17 @@ class TestParquetOfOtherPrograms:
             ({"time": pa.array([], pa.float64()), "x": pa.array([], pa.float64())}, "no rows"),
             ({"time": [0.0, None], "x": [1.0, 2.0]}, "empty cell in row 1, column 'time'"),
             ({"time": [0.0, 1.0], "q": [[1.0], [1.0, 2.0]]}, "lists of 2 lengths in column 'q'"),
+            ({"time": [0.0], "q": pa.array([[]], pa.list_(pa.float64()))}, "no lists with a value"),
+            ({"time": [0.0], "q": pa.array([None], pa.list_(pa.int8()))}, "no lists with a value"),
+            ({"time": [0.0], "q": [[1.0]], "q.0": [1.0]}, "two channels with the name 'q.0'"),
+            (
+                {"time": [0.0], "x": [1.0], "episode": [[1]]},
+                "list<.* in column 'episode', expected",
+            ),
+            (
+                {"time": [0.0], "x": [1.0], "episode": [b"a"]},
+                "binary in column 'episode', expected",
+            ),
         ],
     )
     def test_with_other_columns_is_an_error_of_one_line(self, tmp_path, columns, message):
@@ -298,6 +339,30 @@ class TestParquetOfOtherPrograms:
             labels = pa.array(["a", "a", "b", empty]).dictionary_encode()
             columns = {"time": [0.0, 1.0, 2.0, 3.0], "episode": labels, "x": [1.0] * 4}
             refused(self.written(tmp_path, columns), "empty cell in row 3, column 'episode'")
+
+    def test_with_a_column_twice_is_an_error_of_one_line(self, tmp_path):
+        path, column = tmp_path / "walk.parquet", pa.array([0.0, 1.0])
+        for names in (["time", "x", "x"], ["time", "time", "x"]):
+            pq.write_table(pa.Table.from_arrays([column] * 3, names), path)
+            refused(path, f"the column '{names[1]}' twice")
+        pq.write_table(pa.Table.from_arrays([column] * 4, ["time", "x", "x", "y"]), path)
+        assert read(path, channels=["y"])[0].rows == 2
+
+    def test_may_have_row_groups_without_rows_and_dictionaries_of_numbers(self, tmp_path):
+        some = pa.table({"time": [0.0, 1.0], "x": pa.array([5.0, 5.0]).dictionary_encode()})
+        with pq.ParquetWriter(tmp_path / "walk.parquet", some.schema) as writer:
+            for table in (some.slice(0, 0), some.slice(0, 1), some.slice(0, 0), some.slice(1, 1)):
+                writer.write_table(table)
+        assert read(tmp_path / "walk.parquet")[0].values.tolist() == [[5.0], [5.0]]
+
+    @pytest.mark.parametrize("kind", [pa.uint8(), pa.uint64(), pa.float16(), pa.float32()])
+    def test_may_hold_numbers_of_any_type(self, tmp_path, kind):
+        numbers = pa.array([1, 2, None, 4]).cast(kind)
+        dataset = read(
+            self.written(tmp_path, {"time": pa.array(range(4)).cast(kind), "x": numbers})
+        )
+        assert dataset[0].times.tolist() == [0.0, 1.0, 2.0, 3.0]
+        assert same(dataset[0].values[:, 0], [1, 2, NAN, 4])
 
     def test_of_text_beside_numbers_can_be_read_by_choosing(self, tmp_path):
         path = self.written(tmp_path, {"time": [0.0], "mode": ["up"], "x": [1.0]})
@@ -345,10 +410,26 @@ class TestNpz:
             ({"time": [0.0], "x": [1.0, 2.0]}, r"no array with a row for each of the \(1,\) times"),
             ({"time": ["noon"], "x": [1.0]}, "times of shape .* expected numbers"),
             ({"time": [0.0], "x": [1.0], "episode": [1, 2]}, "labels of shape"),
+            ({"time": np.zeros((2, 0)), "x": np.zeros((2, 0))}, "nothing recorded"),
+            ({"time": [0.0], "q": [[1.0, 2.0]], "q.0": [1.0]}, "two channels with the name 'q.0'"),
+            ({"time": np.array(["2026-11-24", "NaT"], "M8[ns]"), "x": [1.0, 2.0]}, "time in row 1"),
         ],
     )
     def test_with_other_arrays_is_an_error_of_one_line(self, tmp_path, arrays, message):
         refused(self.written(tmp_path, **arrays), message)
+
+    def test_that_is_none_is_an_error_of_one_line(self, tmp_path):
+        path = tmp_path / "walk.npz"
+        with path.open("wb") as file:
+            np.save(file, np.zeros(3))
+        refused(path, "holds one array, expected an NPZ with several")
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("time.npy", b"")
+        refused(path, "holds 'time', which is no array of NumPy")
+        header = {"descr": "<f8", "fortran_order": False, "shape": (10**12,)}
+        with zipfile.ZipFile(path, "w") as file, file.open("time.npy", "w") as entry:
+            np.lib.format.write_array_header_1_0(entry, header)
+        refused(path, "can't be read as NPZ, .*; copy it again")
 
 
 class TestPoses:
@@ -368,10 +449,16 @@ class TestPoses:
             ("# nothing\n", "no line of numbers, expected timestamp tx"),
             ("1 2 3 4 5 6 7 8\n1 2 3\n", "'1 2 3' in line 2, expected eight numbers"),
             ("1 2 3 4 5 6 7 x\n", "'1 2 3 4 5 6 7 x' in line 1"),
+            ("1 2 3 4 5 6 7 8\nnan 2 3 4 5 6 7 8\n", "no time in line 2; drop that row"),
         ],
     )
     def test_of_tum_that_are_none_are_an_error_of_one_line(self, text_file, text, message):
         refused(text_file(text, "walk.tum"), message)
+
+    def test_of_tum_may_end_lines_in_any_way(self, text_file):
+        for end in ("\n", "\r\n", "\r"):
+            text = f"0 1 2 3 0 0 0 1{end}1 2 3 4 0 0 0 1{end}"
+            assert read(text_file(text, "walk.tum"))[0].values[:, 0].tolist() == [1.0, 2.0]
 
     def folder(self, tmp_path):
         for sensor, text in {

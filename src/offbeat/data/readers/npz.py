@@ -83,6 +83,9 @@ def read_npz(
     notes: tuple[str, ...] = ()
     if clock.dtype.kind in "mM":
         unit = _unit_of_dates(path, clock)
+        if np.isnat(clock).any():
+            row = int(np.isnat(clock).argmax())
+            raise FileFormatError(f"{path} has no time in row {row} of {time!r}; drop that row")
         clock = clock.astype(np.int64)
     else:
         unit, notes = state_time_unit(time_unit, time, np.ravel(clock)[:10_000], str(path))
@@ -135,12 +138,19 @@ def _check_size(path: Path) -> None:
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     try:
         # NumPy leaves a file open that it opens itself and can't read.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        with path.open("rb") as opened:
+            file = np.load(opened, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise FileFormatError(f"{path} holds one array, expected an NPZ with several")
             with file:
-                return {name: file[name] for name in file.files}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError) as error:
+                arrays = {name: file[name] for name in file.files}
+        for name, array in arrays.items():
+            if not isinstance(array, np.ndarray):
+                raise FileFormatError(
+                    f"{path} holds {name!r}, which is no array of NumPy; write it with np.savez"
+                )
+        return arrays
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, MemoryError) as error:
         if isinstance(error, FileFormatError):
             raise
         if "allow_pickle" in str(error) and zipfile.is_zipfile(path):

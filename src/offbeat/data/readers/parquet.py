@@ -88,7 +88,7 @@ def read_parquet(
             rows = file.metadata.num_rows
             chunks = functools.partial(_chunks, file)
             widths = {
-                name: _width(path, name, next(chunks(name)))
+                name: _width(path, name, chunks(name))
                 for name in columns.channels
                 if _is_list(schema.field(name).type)
             }
@@ -145,6 +145,18 @@ def _index_of_times(schema: Any) -> str | None:
 def _check_types(path: Path, schema: Any, columns: Columns) -> None:
     import pyarrow as pa
 
+    for name in columns.read:
+        if len(schema.get_all_field_indices(name)) > 1:
+            raise FileFormatError(
+                f"{path} has the column {name!r} twice; give every column a name of its own, or "
+                "choose others with channels="
+            )
+    for label in (columns.label, columns.key):
+        if label is not None and _is_no_label(schema.field(label).type):
+            raise FileFormatError(
+                f"{path} has {schema.field(label).type} in column {label!r}, expected labels: "
+                "texts or numbers; name them with trajectory_column= and channel_column="
+            )
     kind = schema.field(columns.time).type
     times = (pa.types.is_timestamp, pa.types.is_duration, pa.types.is_integer, pa.types.is_floating)
     if not any(fits(kind) for fits in times):
@@ -169,6 +181,13 @@ def _check_types(path: Path, schema: Any, columns: Columns) -> None:
             )
 
 
+def _is_no_label(kind: Any) -> bool:
+    import pyarrow as pa
+
+    binary = (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_fixed_size_binary)
+    return pa.types.is_nested(kind) or any(fits(kind) for fits in binary)
+
+
 def _is_list(kind: Any) -> bool:
     import pyarrow as pa
 
@@ -177,16 +196,23 @@ def _is_list(kind: Any) -> bool:
     )
 
 
-def _width(path: Path, name: str, column: Any) -> int:
+def _width(path: Path, name: str, chunks: Iterator[Any]) -> int:
+    """The length of the lists of a column, by the first chunk that has one."""
     import pyarrow.compute as pc
 
-    lengths = pc.unique(pc.list_value_length(column.drop_null())).to_pylist()
-    if len(lengths) != 1:
-        raise FileFormatError(
-            f"{path} has lists of {len(lengths)} lengths in column {name!r}, expected one length; "
-            "choose the columns that are channels with channels="
-        )
-    return int(lengths[0])
+    for column in chunks:
+        lengths = pc.unique(pc.list_value_length(column.drop_null())).to_pylist()
+        if len(lengths) > 1:
+            raise FileFormatError(
+                f"{path} has lists of {len(lengths)} lengths in column {name!r}, expected one "
+                "length; choose the columns that are channels with channels="
+            )
+        if lengths and lengths[0]:
+            return int(lengths[0])
+    raise FileFormatError(
+        f"{path} has no lists with a value in column {name!r}; choose the columns that are "
+        "channels with channels="
+    )
 
 
 def _spread(columns: Columns, widths: Mapping[str, int]) -> Columns:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import itertools
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,17 @@ from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
 from offbeat.data.readers.stamps import expected_after, form_of, with_stamps
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, InputError
+from offbeat.errors import FileFormatError, InputError, one_of
 
-MISSING = ("", "NaN", "nan", "NA", "N/A", "<NA>", "null", "NULL", "None")
+MISSING = ("", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
 """What a cell holds where its value is not known."""
 
 DELIMITERS = (",", ";", "\t")
 """Tried in this order on the header, where none is given."""
 
+_BLANK = tuple(" " * n for n in range(1, 33))  # a cell that is padded, and nothing else
 _BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
+_COMMA = re.compile(r"[+-]?\d+,\d+")
 _SAMPLE = 1000  # lines that say what a column holds
 _BLOCK = 1 << 20  # bytes of text in memory at a time
 
@@ -40,6 +43,7 @@ def read_csv(
     delimiter: str | None = None,
     channel_column: str | None = None,
     value_column: str | None = None,
+    decimal: str = ".",
 ) -> list[Recording]:
     """Reads recordings from CSV: a header, then one row per time, or one per measured value.
 
@@ -65,6 +69,7 @@ def read_csv(
         channel_column: the column that says which channel a value is of, in the long form; by
             default found where the table has a `channel` and a `value` and nothing else.
         value_column: the column of values, in the long form.
+        decimal: what stands before the fraction of a number, `.` or `,`.
 
     Returns:
         A recording per trajectory, in the order of their first rows; a cell that is empty, or
@@ -81,7 +86,8 @@ def read_csv(
         raise InputError(
             f"delimiter must be one ASCII character, no quote or line end, got {delimiter!r}"
         )
-    file = _CsvFile(require_file(path), delimiter or ",")
+    one_of("decimal", decimal, (".", ","))
+    file = _CsvFile(require_file(path), delimiter or ",", decimal)
     if delimiter is None:
         file = file.with_delimiter_of_header()
     header = file.header()
@@ -99,10 +105,13 @@ def read_csv(
     unit = "ns"
     notes: tuple[str, ...] = ()
     if form_of(_first_time(sample, columns)) is None:
-        numbers = [float(cell) for cell in sample[columns.time] if _is_number(cell)]
+        found = [file.number(cell) for cell in sample[columns.time]]
+        numbers = [number for number in found if number is not None]
         unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
     if not header[0]:
         notes = (*notes, "the first column has no name and counts the rows; it is left out")
+    if not header[-1]:
+        notes = (*notes, "the last column has no name and is empty; it is left out")
     table, counted_in = file.columns(header, sample, columns, unit)
     return recordings(file.path, columns, counted_in, notes, table, shown=unit)
 
@@ -113,6 +122,7 @@ class _CsvFile:
 
     path: Path
     delimiter: str
+    decimal: str
 
     def with_delimiter_of_header(self) -> _CsvFile:
         """The same file, with the delimiter that its header has."""
@@ -120,11 +130,11 @@ class _CsvFile:
         if len(cells) == 1:
             for delimiter in DELIMITERS[1:]:
                 if delimiter in cells[0]:
-                    return _CsvFile(self.path, delimiter)
+                    return replace(self, delimiter=delimiter)
         return self
 
     def header(self) -> list[str]:
-        """The column names, stripped; unique; the first may be empty, where it counts the rows."""
+        """The column names, stripped; unique; empty where one counts rows or ends all lines."""
         line, cells = next(self._lines(), (0, []))
         names = [cell.strip() for cell in cells]
         if line != 1:
@@ -136,7 +146,10 @@ class _CsvFile:
         if names[0] == "Unnamed: 0":
             names[0] = ""
         for i, name in enumerate(names):
-            if name in names[:i] or not (name or (i == 0 and self._counts_rows())):
+            unnamed = (i == 0 and self._counts_rows()) or (
+                i == len(names) - 1 and self._is_empty(i)
+            )
+            if (name in names[:i] and name) or not (name or unnamed):
                 fault = f"the column name {name!r} twice" if name else f"no name for column {i}"
                 raise FileFormatError(
                     f"{self.path} has {fault} in its first line, got {listed(names)}; "
@@ -148,6 +161,11 @@ class _CsvFile:
         cells = [line[0] for _, line in itertools.islice(self._lines(), 1, _SAMPLE)]
         first = int(cells[0]) if cells and cells[0].isdecimal() else 0
         return cells == [str(first + i) for i in range(len(cells))]
+
+    def _is_empty(self, place: int) -> bool:
+        """Whether a column holds nothing, in the first lines."""
+        lines = itertools.islice(self._lines(), 1, _SAMPLE)
+        return not any(cell.strip() for _, cells in lines for cell in cells[place:])
 
     def sample(self, header: list[str]) -> dict[str, list[str]]:
         """The cells of the first lines, by column."""
@@ -165,12 +183,16 @@ class _CsvFile:
         types |= {name: pa.string() for name in (columns.label, columns.key) if name}
         places = len(str(NANOSECONDS_PER[unit])) - 1
         clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
-        if not all(cell.lstrip("+-").isdecimal() for cell in sample[columns.time]):
+        if not all(
+            cell.isascii() and cell.lstrip("+-").isdecimal() for cell in sample[columns.time]
+        ):
             clocks = clocks[1:]
         form = form_of(_first_time(sample, columns))
         if form is not None:
             clocks = [pa.string()]
         lines = self._count_lines()
+        if lines < 2:
+            raise FileFormatError(f"{self.path} has a header and no rows, expected one per time")
         require_rows(self.path, lines - 1, len(columns.channels))
         for clock in clocks:
             batches = self._batches(header, columns, types | {columns.time: clock})
@@ -202,7 +224,10 @@ class _CsvFile:
             read_options=pv.ReadOptions(column_names=names, skip_rows=1, block_size=_BLOCK),
             parse_options=pv.ParseOptions(delimiter=self.delimiter, newlines_in_values=True),
             convert_options=pv.ConvertOptions(
-                column_types=types, include_columns=columns.read, null_values=MISSING
+                column_types=types,
+                include_columns=columns.read,
+                null_values=(*MISSING, *_BLANK),
+                decimal_point=self.decimal,
             ),
         ) as reader:
             yield from reader
@@ -246,14 +271,18 @@ class _CsvFile:
                     f"one per column: {listed(header)}"
                 )
             for name, cell in zip(header, cells, strict=True):
-                if line == 1 or name not in columns.read or cell.strip() in MISSING:
+                if line == 1 or name not in columns.read or cell in MISSING or not cell.strip():
                     continue
-                if name == columns.time:
-                    fits = _is_number(cell) if form is None else form_of(cell.strip()) == form
+                number = self.number(cell)
+                comma = number is None and self.decimal == "." and _COMMA.fullmatch(cell.strip())
+                if name in (columns.time, *columns.channels) and comma:
+                    expected = "a number; if its comma is a decimal point, say so with decimal=','"
+                elif name == columns.time:
+                    fits = number is not None if form is None else form_of(cell.strip()) == form
                     expected = "" if fits else expected_after(first)
                 elif name in truths:
                     expected = "" if cell in _BOOLEANS else f"one of {', '.join(_BOOLEANS)}"
-                elif name in columns.channels and not _is_number(cell):
+                elif name in columns.channels and number is None:
                     expected = "a number; choose the columns that are channels with channels="
                 else:
                     continue
@@ -262,6 +291,17 @@ class _CsvFile:
                         f"{self.path} has {cell!r} in line {line}, column {name!r}, expected "
                         f"{expected}"
                     )
+
+    def number(self, cell: str) -> float | None:
+        """The number in a cell, or None."""
+        if self.decimal != ".":
+            cell = cell.replace(".", "?").replace(self.decimal, ".")
+        try:
+            number = float(cell)
+        except ValueError:
+            return None
+        # Python allows _ between digits, and digits of other scripts, and nobody else does.
+        return number if cell.isascii() and "_" not in cell else None
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
         """Line numbers and cells, header included; empty lines are skipped, as pyarrow does."""
@@ -292,11 +332,3 @@ def _type_of(cells: list[str]) -> Any:
 def _holds_booleans(cells: list[str]) -> bool:
     known = [cell for cell in cells if cell not in MISSING]
     return bool(known) and all(cell in _BOOLEANS for cell in known)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return "_" not in cell  # which Python allows between digits, and nobody else
