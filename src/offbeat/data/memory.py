@@ -12,7 +12,7 @@ from offbeat.errors import FileFormatError
 
 _PROC = Path("/proc")
 _GROUPS = Path("/sys/fs/cgroup")
-_PER_CELL, _PER_ROW = 10, 48  # bytes: a value and two masks; stamps, times and steps
+_PER_CELL, _PER_ROW = 9, 32  # bytes: a value and its mask; stamps, times and steps
 
 
 def require_rows(

@@ -111,7 +111,10 @@ def read_csv(
     if not header[0]:
         notes = (*notes, "the first column has no name and counts the rows; it is left out")
     if not header[-1]:
-        notes = (*notes, "the last column has no name and is empty; it is left out")
+        notes = (
+            *notes,
+            "the last column has no name and no cell in the first lines; it is left out",
+        )
     table, counted_in = file.columns(header, sample, columns, unit)
     return recordings(file.path, columns, counted_in, notes, table, shown=unit)
 
