@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -203,6 +204,46 @@ def test_predict_keeps_the_clock_of_a_log_in_nanoseconds(run, data, tmp_path):
         lines = list(csv.DictReader(file))
     assert [float(line["time"]) for line in lines] == [0.0025, 0.02]
     assert [int(line["clock_ns"]) for line in lines] == [start + 2_500_000, start + 20_000_000]
+
+
+@pytest.fixture
+def stamped(data, tmp_path):
+    """A log of 4 rows whose clock shows 100 s at the first, in a column that must be named."""
+    path = tmp_path / "stamped.csv"
+    with path.open("w", newline="") as file:
+        rows = [[f"{100 + 0.005 * i:.3f}", *[0.1 * i] * 14] for i in range(4)]
+        csv.writer(file).writerows([["when", *ob.load(data).names], *rows])
+    return path
+
+
+def test_predict_takes_times_since_the_first_row_or_on_the_clock(run, stamped, tmp_path, capsys):
+    out, named = tmp_path / "out.csv", "--reader.time_column=when"
+    answers = []
+    for options in (["--times=0.01"], ["--times=100.01", "--reader.start=clock"]):
+        assert main(["predict", str(run), str(stamped), str(out), named, *options]) == 0
+        with out.open(newline="") as file:
+            answers += list(csv.DictReader(file))
+    since, shown = answers
+    assert (since.pop("time"), since.pop("clock_s")) == ("0.01", "100.01")
+    assert shown.pop("time") == "100.01"
+    assert since == pytest.approx(shown)
+    error = one_line_error(capsys, "predict", run, stamped, out, named, "--times=[0.01, 100.01]")
+    assert "showed 100.0 s; 100.01 is later than its last row, 0.015, but" in error
+    assert "give 0.01, or read it with --reader.start clock" in error
+    assert main(["predict", str(run), str(stamped), str(out), named, "--times=150"]) == 0
+
+
+def test_options_of_the_run_hold_beside_those_that_are_given(run, stamped, tmp_path, capsys):
+    copy, out = tmp_path / "run", tmp_path / "out.csv"
+    shutil.copytree(run, copy)
+    (copy / "reader.json").write_text('{"time_column": "when", "time_unit": "s"}')
+    predict = ["predict", str(copy), str(stamped), str(out), "--times=0.01"]
+    for options in ([], ["--reader.held=mask"]):
+        assert main([*predict, *options]) == 0
+    assert main([*predict, "--time_unit=ms"]) == 0
+    with out.open(newline="") as file:
+        assert [row["clock_ms"] for row in csv.DictReader(file)] == ["110"]
+    assert "no column of times" in one_line_error(capsys, *predict, "--reader.format=csv")
 
 
 def test_doctor_says_what_is_installed(capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from offbeat.data import mend
 from offbeat.data.policies import sentences
 from offbeat.data.recording import Policies, Recording, Signal, assemble
 from offbeat.errors import FileFormatError, InputError
@@ -304,6 +306,27 @@ class TestHeldValues:
         dataset = assemble(parts, Policies(held="mask"))
         assert report(dataset)["held"]["channels"]["x"]["rows_per_value"] == 4
         assert all(t.known.sum() == 3 for t in dataset)
+
+    @given(
+        st.lists(
+            st.lists(st.sampled_from([0.0, 1.0, 2.0, NAN, float("inf")]), max_size=60), max_size=3
+        ),
+        st.integers(1, 3),
+    )
+    def test_held_is_what_its_definition_says_however_early_it_is_decided(self, episodes, repeat):
+        columns = [np.repeat(np.array(column, dtype=float), repeat) for column in episodes]
+        known = [[x for x in column.tolist() if not np.isnan(x)] for column in columns]
+        pairs = [a == b for column in known for a, b in itertools.pairwise(column)]
+        runs = [
+            len(list(run))
+            for column in known
+            for run in [list(g) for _, g in itertools.groupby(column)][:-1]
+        ]
+        usual = int(np.median(runs)) if runs else 0
+        expected = None
+        if pairs and sum(pairs) >= 0.5 * len(pairs) and len(runs) >= 10 and usual >= 2:
+            expected = mend.Held(sum(pairs) / len(pairs), usual)
+        assert mend.find_held(columns) == expected
 
 
 class TestAngles:

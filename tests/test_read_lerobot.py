@@ -51,6 +51,12 @@ class TestADataSet:
             assert np.array_equal(trajectory.values, expected["observation.state"])
             assert np.array_equal(trajectory.actions, expected["action"])
 
+    def test_that_does_not_fit_into_memory_is_refused_before_it_is_read(self, write, monkeypatch):
+        monkeypatch.setattr("offbeat.data.memory.available_memory", lambda: 1000)
+        root = write()
+        refused(root, "16 rows x 5 channels, .*; choose episodes= or columns=, or split the file")
+        assert len(list(lerobot.recordings(root, episodes=[0]))) == 1
+
     def test_says_aloud_that_its_stamps_are_made_up(self, write):
         dataset = read(write())
         assert dataset[0].times.tolist() == [0.0, 0.05, 0.1, 0.15]

@@ -186,7 +186,7 @@ class TestCsv:
             ("time,x\n", "a header and no rows"),
             ("time,x\n0,1\n\n1,two\n", "'two' in line 4, column 'x', expected a number"),
             ("time,x\n0,1\n1,1_0\n", "'1_0' in line 3, column 'x', expected a number"),
-            ("time,x\n2024-05-01,1\n", "'2024-05-01' in line 2, column 'time', expected a number"),
+            ("time,x\n2024-05-32,1\n", "'2024-05-32' in line 2, column 'time', expected a number"),
             ("time,x\n0,1\n1\n", "1 cells in line 3, expected 2, one per column"),
             ("time,x\n0,1\n1,2,3\n", "3 cells in line 3, expected 2"),
             ("time,x\n0,1\n,2\n", "no time in line 3, column 'time'"),

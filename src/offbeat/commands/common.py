@@ -35,8 +35,8 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
 
     Args:
         data: the file.
-        reader: options of `offbeat.read`: `format`, and those of the format; None takes those that
-            the run was trained with.
+        reader: options of `offbeat.read`: `format`, and those of the format; those that the run was
+            trained with hold beside them, unless there is a `format`.
         run: folder of a run.
 
     Raises:
@@ -45,14 +45,26 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
     """
     from offbeat.data.readers import read
 
-    if reader is None and run is not None and (run / READER_FILE).is_file():
-        try:
-            reader = dict(json.loads((run / READER_FILE).read_text(encoding="utf-8")))
-        except (TypeError, ValueError) as error:
-            raise FileFormatError(
-                f"{run / READER_FILE} is damaged ({error}); give --reader"
-            ) from None
-    return read(data, **(reader or {}))
+    return read(data, **reader_options(reader, run))
+
+
+def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str, Any]:
+    """The options given, and beside them those that the run was trained with.
+
+    Where a format is given, those of the run may be of another one, and count no more.
+
+    Raises:
+        FileFormatError: those of the run are damaged.
+    """
+    given = dict(reader or {})
+    if "format" in given or run is None or not (run / READER_FILE).is_file():
+        return given
+    try:
+        return {**json.loads((run / READER_FILE).read_text(encoding="utf-8")), **given}
+    except (TypeError, ValueError) as error:
+        raise FileFormatError(
+            f"{run / READER_FILE} is damaged ({error}); give --reader.format and other options"
+        ) from None
 
 
 def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) -> dict[str, Any]:

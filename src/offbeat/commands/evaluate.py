@@ -54,8 +54,8 @@ def evaluate_command(
         figure: .png, .pdf or .svg of one trajectory, its hidden cells and what fills them.
         channels: to draw; by default the first four.
         trajectory: to draw, counted from 0 within the part.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; by default
-            those of the run.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
+            own hold for what is not given, unless a format is.
         seed: of hidden rows and coins.
         json: print the scores as JSON.
     """

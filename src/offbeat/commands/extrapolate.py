@@ -41,8 +41,8 @@ def extrapolate_command(
             constant velocity.
         channels: to draw; by default the first four.
         trajectory: to draw, counted from 0.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; by default
-            those of the run.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
+            own hold for what is not given, unless a format is.
         json: print what was written as JSON.
     """
     import numpy as np

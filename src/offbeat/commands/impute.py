@@ -43,8 +43,8 @@ def impute_command(
         figure: .png, .pdf or .svg of one trajectory, its fills, linear interpolation and PCHIP.
         channels: to draw; by default the first four.
         trajectory: to draw, counted from 0.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; by default
-            those of the run.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
+            own hold for what is not given, unless a format is.
         seed: of the coins of self-feeding.
         json: print what was written as JSON.
     """

@@ -173,7 +173,8 @@ def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], i
                     "that they are in with time_unit"
                 )
             clock = clock - clock.dtype.type(zero)
-        return clock.astype(np.int64) * factor, zero
+        stamps = clock.astype(np.int64, copy=False)
+        return stamps if factor == 1 else stamps * factor, zero
     floats = clock.astype(np.float64)
     bad = ~np.isfinite(floats)
     if bad.any():

@@ -15,6 +15,7 @@ HELD_SHARE = 0.5
 """Share of rows that repeat the value before them, from which on a channel can be held."""
 
 _FEWEST_RUNS = 10
+_BLOCK = 1 << 14  # rows that stay in cache while they are looked at
 _QUATERNION = re.compile(r"(.*?)(?:^|[._\s\-/]|(?<=q)|(?<=quat)|(?<=quaternion))([wxyz])")
 _ROTATION = re.compile(r"q$|quat|orient|rotation|attitude|(^|[._\s\-/])q", re.IGNORECASE)
 
@@ -42,6 +43,8 @@ def find_held(columns: Sequence[Values]) -> Held | None:
     Args:
         columns: (rows,) its values in each episode, NaN = missing.
     """
+    if _changes_mostly(columns):
+        return None
     columns = [_known(column) for column in columns]
     cells = sum(len(column) - 1 for column in columns if len(column))
     repeats = sum(int(np.count_nonzero(column[1:] == column[:-1])) for column in columns)
@@ -57,6 +60,23 @@ def find_held(columns: Sequence[Values]) -> Held | None:
         return None
     usual = int(np.median(runs))
     return Held(repeats / cells, usual) if usual >= 2 else None
+
+
+def _changes_mostly(columns: Sequence[Values]) -> bool:
+    """Whether a part of the rows says already that too few of them can repeat the one before.
+
+    Two rows in a row that are known and differ are a change, whatever is known elsewhere.
+    """
+    enough = (1 - HELD_SHARE) * sum(len(column) - 1 for column in columns if len(column))
+    changes = 0
+    for column in columns:
+        for start in range(0, len(column) - 1, _BLOCK):
+            block = column[start : start + _BLOCK + 1]
+            changes += int(np.count_nonzero(block[1:] > block[:-1]))
+            changes += int(np.count_nonzero(block[1:] < block[:-1]))
+            if changes > enough:
+                return True
+    return False
 
 
 def _known(column: Values) -> Values:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.memory import require_rows
 from offbeat.data.schema import METADATA_KEY, Schema
 from offbeat.data.source import require_file
 from offbeat.data.trajectory import Dataset, Trajectory
@@ -81,6 +82,7 @@ def load(path: str | Path) -> Dataset:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             schema = Schema.from_metadata(file.schema_arrow.metadata, path)
             schema.check_columns(file.schema_arrow, path)
+            require_rows(path, schema.rows, len(schema.names), "", copies=2)
             table = file.read()
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise FileFormatError(

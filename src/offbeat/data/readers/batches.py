@@ -1,8 +1,9 @@
-"""Batches of Arrow, gathered column by column: beside the result, one batch is in memory."""
+"""Columns of Arrow, gathered chunk by chunk: beside the result, one chunk is in memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.readers.columns import Coder, Columns, Gathered
+from offbeat.data.readers.columns import Coded, Coder, Columns, Gathered
 from offbeat.errors import FileFormatError
 
 
@@ -26,8 +27,6 @@ def gather(
     batches: Iterable[Any],
     columns: Columns,
     capacity: int,
-    *,
-    widths: Mapping[str, int] = MappingProxyType({}),
 ) -> Gathered:
     """Copies the columns that are needed out of record batches, one batch at a time.
 
@@ -35,7 +34,6 @@ def gather(
         batches: `pyarrow.RecordBatch`es with the columns `columns.read`.
         columns: what they are.
         capacity: at least the number of rows; what is too much costs address space alone.
-        widths: how many channels a column of lists gives.
 
     Raises:
         NullCellError: a time, label or key is missing.
@@ -43,8 +41,7 @@ def gather(
         OverflowError: a time of decimals exceeds an int64 of nanoseconds.
     """
     # Columns lie one after the other, so that each is filled and looked at in one stretch.
-    channels = sum(widths.get(name, 1) for name in columns.channels)
-    values = np.empty((channels, capacity))
+    values = np.empty((len(columns.channels), capacity))
     clocks: list[NDArray[Any]] = []
     labels = Coder() if columns.label else None
     keys = Coder() if columns.key else None
@@ -55,13 +52,8 @@ def gather(
                 coder.add(_without_nulls(_text(batch.column(name)), name, rows))
         clocks.append(clock_of(_without_nulls(batch.column(columns.time), columns.time, rows)))
         end = rows + batch.num_rows
-        c = 0
-        for name in columns.channels:
-            column, width = batch.column(name), widths.get(name, 1)
-            values[c : c + width, rows:end] = (
-                _lists(column, name, width) if name in widths else _numbers(column)
-            )
-            c += width
+        for c, name in enumerate(columns.channels):
+            _put(values[c, rows:end], batch.column(name))
         rows = end
     clock = np.concatenate(clocks) if clocks else np.zeros(0, dtype=np.int64)
     return Gathered(
@@ -70,6 +62,60 @@ def gather(
         keys.done() if keys else None,
         values[:, :rows].T,
     )
+
+
+def gather_columns(
+    sources: Sequence[Callable[[str], Iterable[Any]]],
+    columns: Columns,
+    rows: int,
+    *,
+    widths: Mapping[str, int] = MappingProxyType({}),
+) -> Gathered:
+    """Copies columns of a file that can be read one by one, chunk by chunk.
+
+    That keeps less in memory than batches of all columns, and what is decoded stays in cache.
+
+    Args:
+        sources: each gives the Arrow arrays of a column, all of the same; a thread for each.
+        columns: what the columns are.
+        rows: their length.
+        widths: how many channels a column of lists gives.
+
+    Raises:
+        NullCellError, FileFormatError, OverflowError: as `gather`.
+    """
+    clock = np.concatenate([clock_of(c) for c in _known(sources[0](columns.time), columns.time)])
+    coded: list[Coded | None] = []
+    for name in (columns.label, columns.key):
+        coder = Coder()
+        for column in _known(map(_text, sources[0](name)), name) if name is not None else ():
+            coder.add(column)
+        coded.append(coder.done() if name is not None else None)
+    first = np.cumsum([0, *(widths.get(name, 1) for name in columns.channels)])
+    values = np.empty((first[-1], rows))
+
+    def fill(worker: int) -> None:
+        for place in range(worker, len(columns.channels), len(sources)):
+            name, start, at = columns.channels[place], 0, first[place]
+            for column in sources[worker](name):
+                end = start + len(column)
+                if name in widths:
+                    values[at : first[place + 1], start:end] = _lists(column, name, widths[name])
+                else:
+                    _put(values[at, start:end], column)
+                start = end
+
+    with ThreadPoolExecutor(len(sources)) as pool:
+        for _ in pool.map(fill, range(len(sources))):
+            pass  # raises what a thread raised
+    return Gathered(clock, coded[0], coded[1], values.T)
+
+
+def _known(chunks: Iterable[Any], name: str) -> Iterator[Any]:
+    start = 0
+    for column in chunks:
+        yield _without_nulls(column, name, start)
+        start += len(column)
 
 
 def clock_of(column: Any) -> NDArray[Any]:
@@ -92,13 +138,20 @@ def clock_of(column: Any) -> NDArray[Any]:
     return np.asarray(column.to_numpy(zero_copy_only=False))
 
 
-def _numbers(column: Any) -> NDArray[Any]:
-    """Float64, null = NaN."""
+def _put(out: NDArray[np.float64], column: Any) -> None:
+    """Copies a column of numbers, null = NaN."""
     import pyarrow as pa
 
     if not pa.types.is_float64(column.type):
         column = column.cast(pa.float64(), safe=False)
-    return np.asarray(column.to_numpy(zero_copy_only=False))
+    if column.null_count == len(column):
+        out[:] = np.nan
+        return
+    known, numbers = column.buffers()
+    out[:] = np.frombuffer(numbers, np.float64, len(column), 8 * column.offset)
+    if column.null_count:
+        bits = np.unpackbits(np.frombuffer(known, np.uint8), bitorder="little")
+        out[np.flatnonzero(bits[column.offset :][: len(column)] == 0)] = np.nan
 
 
 def _lists(column: Any, name: str, width: int) -> NDArray[Any]:
@@ -113,8 +166,10 @@ def _lists(column: Any, name: str, width: int) -> NDArray[Any]:
             f"column {name!r} holds lists of {width} values and of {lengths[lengths != width][0]}, "
             "expected one length; choose the columns that are channels with channels="
         )
+    flat = np.empty(width * len(lists))
+    _put(flat, lists.flatten())
     spread = np.full((width, len(column)), np.nan)
-    spread[:, there] = _numbers(lists.flatten()).reshape(-1, width).T
+    spread[:, there] = flat.reshape(-1, width).T
     return spread
 
 

@@ -244,8 +244,15 @@ def recordings(
         shown: the unit that the file counts in, where the clock is in another one already.
 
     Raises:
-        FileFormatError: a time is not finite, or a channel that is asked for is in no row.
+        FileFormatError: a time is not finite, a channel that is asked for is in no row, or two
+            have one name.
     """
+    for i, name in enumerate(columns.names):
+        if name in columns.names[:i]:
+            raise FileFormatError(
+                f"{path} has two channels with the name {name!r}; rename one, or choose others "
+                "with channels="
+            )
     try:
         stamps, zero = to_nanoseconds(table.clock, unit)
     except FileFormatError as error:
@@ -294,6 +301,8 @@ def _groups(coded: Coded | None) -> list[tuple[str, Any]]:
     if coded is None:
         return [("", slice(None))]
     codes = coded.codes
+    if not len(codes):
+        return []
     starts = np.flatnonzero(np.diff(codes, prepend=-1))
     met = codes[starts]
     if len(np.unique(met)) == len(met):  # one stretch each: nothing needs to be copied

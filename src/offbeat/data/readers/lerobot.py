@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.clock import state_time_unit, to_nanoseconds
+from offbeat.data.memory import require_rows
 from offbeat.data.readers.lerobot_info import Feature, Info, Rows, read_columns
 from offbeat.data.signals import Recording, Signal
 from offbeat.errors import FileFormatError, one_of
@@ -92,6 +93,9 @@ def recordings(
     acted = (
         [f for f in info.features.values() if f.name in ("action", "actions")] if actions else []
     )
+    lengths = [at.length or 0 for at in files.values()]
+    width = sum(feature.width for feature in (*chosen, *acted))
+    require_rows(root, sum(lengths), width, "choose episodes= or columns=")
     reading = _Reading(info, chosen, acted, time_column, time_unit, tuple(notes))
     for number, at in files.items():
         yield reading.recording(number, at)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.clock import state_time_unit, time_column_of
+from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import LABEL_NAMES, Coder, Columns, Gathered, listed, recordings
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
@@ -55,6 +56,7 @@ def read_npz(
         InputError: an option names an array or a unit that there is not.
     """
     path = require_file(path)
+    _check_size(path)
     arrays = _load(path)
     time = (
         time_column_of(list(arrays))
@@ -81,6 +83,9 @@ def read_npz(
     notes: tuple[str, ...] = ()
     if clock.dtype.kind in "mM":
         unit = _unit_of_dates(path, clock)
+        if np.isnat(clock).any():
+            row = int(np.isnat(clock).argmax())
+            raise FileFormatError(f"{path} has no time in row {row} of {time!r}; drop that row")
         clock = clock.astype(np.int64)
     else:
         unit, notes = state_time_unit(time_unit, time, np.ravel(clock)[:10_000], str(path))
@@ -120,15 +125,32 @@ def read_npz(
     )
 
 
+def _check_size(path: Path) -> None:
+    """Raises an error where the arrays, once unpacked, and the values made of them do not fit."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = sum(member.file_size for member in file.infolist())
+    except (zipfile.BadZipFile, OSError):
+        return  # what is wrong with it is said when it is read
+    require_memory(path, 2 * size, f"{size} bytes of arrays")
+
+
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     try:
         # NumPy leaves a file open that it opens itself and can't read.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        with path.open("rb") as opened:
+            file = np.load(opened, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise FileFormatError(f"{path} holds one array, expected an NPZ with several")
             with file:
-                return {name: file[name] for name in file.files}
-    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError) as error:
+                arrays = {name: file[name] for name in file.files}
+        for name, array in arrays.items():
+            if not isinstance(array, np.ndarray):
+                raise FileFormatError(
+                    f"{path} holds {name!r}, which is no array of NumPy; write it with np.savez"
+                )
+        return arrays
+    except (ValueError, EOFError, OSError, zipfile.BadZipFile, KeyError, MemoryError) as error:
         if isinstance(error, FileFormatError):
             raise
         if "allow_pickle" in str(error) and zipfile.is_zipfile(path):

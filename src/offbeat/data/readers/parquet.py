@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from offbeat.data.clock import state_time_unit, time_column_of
-from offbeat.data.readers.batches import NullCellError, gather, line_error
+from offbeat.data.memory import require_rows
+from offbeat.data.readers.batches import NullCellError, gather_columns, line_error
 from offbeat.data.readers.columns import Columns, listed, recordings
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError
 
 _ROWS = 1 << 16  # in memory at a time, beside the result
-_BUFFER = 1 << 18  # bytes of each column in memory at a time
+_BUFFER = 1 << 18  # bytes of a column as it is stored, in memory at a time
+_THREADS = 4  # columns that are read at once, at most
+_MANY = 1 << 20  # cells that are worth a thread
 _INDEX = "__index_level_0__"  # what pandas calls an index without a name
 
 
@@ -63,8 +67,10 @@ def read_parquet(
 
     path = require_file(path)
     try:
-        # Else a whole row group, which can be all of the file, would lie in memory, too.
-        with pq.ParquetFile(path, pre_buffer=False, buffer_size=_BUFFER) as file:
+        with ExitStack() as opened:
+            # Else a whole row group, which can be all of the file, would lie in memory.
+            bounded = {"pre_buffer": False, "buffer_size": _BUFFER}
+            file = opened.enter_context(pq.ParquetFile(path, **bounded))
             schema = file.schema_arrow
             columns = Columns.of(
                 path,
@@ -79,10 +85,10 @@ def read_parquet(
             _check_types(path, schema, columns)
             if not file.metadata.num_rows:
                 raise FileFormatError(f"{path} has columns and no rows, expected one per time")
-            batches = file.iter_batches(_ROWS, columns=columns.read)
-            first = next(batches)
+            rows = file.metadata.num_rows
+            chunks = functools.partial(_chunks, file)
             widths = {
-                name: _width(path, name, first.column(name))
+                name: _width(path, name, chunks(name))
                 for name in columns.channels
                 if _is_list(schema.field(name).type)
             }
@@ -91,15 +97,16 @@ def read_parquet(
             if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
                 unit = str(kind.unit)
             else:
-                sample = first.column(columns.time).drop_null()
+                sample = next(chunks(columns.time)).drop_null()
                 sample = sample.cast(pa.float64(), safe=False).to_numpy()
                 unit, notes = state_time_unit(time_unit, columns.time, sample, str(path))
-            table = gather(
-                itertools.chain([first], batches),
-                columns,
-                file.metadata.num_rows,
-                widths=widths,
-            )
+            width = sum(widths.get(name, 1) for name in columns.channels)
+            require_rows(path, rows, width)
+            sources = [chunks]
+            while len(sources) < min(_THREADS, pa.cpu_count(), rows * len(columns.read) // _MANY):
+                other = pq.ParquetFile(path, metadata=file.metadata, **bounded)
+                sources.append(functools.partial(_chunks, opened.enter_context(other)))
+            table = gather_columns(sources, columns, rows, widths=widths)
     except NullCellError as error:
         raise FileFormatError(
             f"{path} has an empty cell in row {error.row}, column {error.column!r}, where every "
@@ -112,6 +119,12 @@ def read_parquet(
             f"({str(said).removeprefix(f'{path}: ')}); copy it again"
         ) from None
     return recordings(path, _spread(columns, widths), unit, notes, table)
+
+
+def _chunks(file: Any, name: str) -> Iterator[Any]:
+    """The Arrow arrays of a column, one after the other."""
+    for batch in file.iter_batches(_ROWS, columns=[name], use_threads=False):
+        yield batch.column(name)
 
 
 def _names(schema: Any, time_column: str | None) -> list[str]:
@@ -132,6 +145,18 @@ def _index_of_times(schema: Any) -> str | None:
 def _check_types(path: Path, schema: Any, columns: Columns) -> None:
     import pyarrow as pa
 
+    for name in columns.read:
+        if len(schema.get_all_field_indices(name)) > 1:
+            raise FileFormatError(
+                f"{path} has the column {name!r} twice; give every column a name of its own, or "
+                "choose others with channels="
+            )
+    for label in (columns.label, columns.key):
+        if label is not None and _is_no_label(schema.field(label).type):
+            raise FileFormatError(
+                f"{path} has {schema.field(label).type} in column {label!r}, expected labels: "
+                "texts or numbers; name them with trajectory_column= and channel_column="
+            )
     kind = schema.field(columns.time).type
     times = (pa.types.is_timestamp, pa.types.is_duration, pa.types.is_integer, pa.types.is_floating)
     if not any(fits(kind) for fits in times):
@@ -156,6 +181,13 @@ def _check_types(path: Path, schema: Any, columns: Columns) -> None:
             )
 
 
+def _is_no_label(kind: Any) -> bool:
+    import pyarrow as pa
+
+    binary = (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_fixed_size_binary)
+    return pa.types.is_nested(kind) or any(fits(kind) for fits in binary)
+
+
 def _is_list(kind: Any) -> bool:
     import pyarrow as pa
 
@@ -164,16 +196,23 @@ def _is_list(kind: Any) -> bool:
     )
 
 
-def _width(path: Path, name: str, column: Any) -> int:
+def _width(path: Path, name: str, chunks: Iterator[Any]) -> int:
+    """The length of the lists of a column, by the first chunk that has one."""
     import pyarrow.compute as pc
 
-    lengths = pc.unique(pc.list_value_length(column.drop_null())).to_pylist()
-    if len(lengths) != 1:
-        raise FileFormatError(
-            f"{path} has lists of {len(lengths)} lengths in column {name!r}, expected one length; "
-            "choose the columns that are channels with channels="
-        )
-    return int(lengths[0])
+    for column in chunks:
+        lengths = pc.unique(pc.list_value_length(column.drop_null())).to_pylist()
+        if len(lengths) > 1:
+            raise FileFormatError(
+                f"{path} has lists of {len(lengths)} lengths in column {name!r}, expected one "
+                "length; choose the columns that are channels with channels="
+            )
+        if lengths and lengths[0]:
+            return int(lengths[0])
+    raise FileFormatError(
+        f"{path} has no lists with a value in column {name!r}; choose the columns that are "
+        "channels with channels="
+    )
 
 
 def _spread(columns: Columns, widths: Mapping[str, int]) -> Columns:

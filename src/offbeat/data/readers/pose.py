@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from offbeat.data.readers.batches import gather
+from offbeat.data.memory import require_memory
+from offbeat.data.readers.batches import NullCellError, gather
 from offbeat.data.readers.columns import Columns, recordings
 from offbeat.data.readers.table import read_csv
 from offbeat.data.recording import Recording, Signal
@@ -16,6 +17,8 @@ from offbeat.errors import FileFormatError, InputError, one_of
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 """The eight numbers of a line of TUM: seconds, metres, and a quaternion with its scalar last."""
+
+_COPIES = 3  # of a text in memory, while it is read
 
 _TUM = Columns("timestamp", None, TUM_COLUMNS[1:], TUM_COLUMNS[1:], ("m",) * 3 + ("",) * 4)
 
@@ -40,7 +43,10 @@ def read_tum(path: str | Path) -> list[Recording]:
     import pyarrow.csv as pv
 
     path = require_file(path)
-    text = path.read_bytes().removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
+    size = path.stat().st_size
+    require_memory(path, _COPIES * size, f"{size} bytes of text")
+    text = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = re.sub(rb"(?m)^[ \t]*(?:#.*)?\n?", b"", text)
     text = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)[ \t]+$", b"", text))
     if not text:
@@ -58,7 +64,7 @@ def read_tum(path: str | Path) -> list[Recording]:
             ).to_batches()
             table = gather(batches, _TUM, text.count(b"\n") + 1)
             break
-        except (pa.ArrowException, OverflowError):
+        except (pa.ArrowException, OverflowError, NullCellError):
             _explain(path)
     else:
         raise FileFormatError(f"{path} can't be read as TUM text; expected {' '.join(TUM_COLUMNS)}")
@@ -172,6 +178,8 @@ def _explain(path: Path) -> None:
                         f"{path} has {said[:60]!r} in line {number}, expected eight numbers: "
                         f"{' '.join(TUM_COLUMNS)}"
                     )
+                if said.casefold().startswith("nan"):
+                    raise FileFormatError(f"{path} has no time in line {number}; drop that row")
     except UnicodeDecodeError as error:
         raise FileFormatError(
             f"{path} can't be read as text ({error}); it must be in UTF-8"

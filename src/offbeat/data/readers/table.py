@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import csv
 import itertools
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from offbeat.data.clock import NANOSECONDS_PER, state_time_unit
+from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullCellError, gather, line_error
 from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
+from offbeat.data.readers.stamps import expected_after, form_of, with_stamps
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, InputError
+from offbeat.errors import FileFormatError, InputError, one_of
 
-MISSING = ("", "NaN", "nan", "NA", "N/A", "<NA>", "null", "NULL", "None")
+MISSING = ("", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
 """What a cell holds where its value is not known."""
 
 DELIMITERS = (",", ";", "\t")
 """Tried in this order on the header, where none is given."""
 
+_BLANK = tuple(" " * n for n in range(1, 33))  # a cell that is padded, and nothing else
 _BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
+_COMMA = re.compile(r"[+-]?\d+,\d+")
 _SAMPLE = 1000  # lines that say what a column holds
 _BLOCK = 1 << 20  # bytes of text in memory at a time
 
@@ -38,12 +43,15 @@ def read_csv(
     delimiter: str | None = None,
     channel_column: str | None = None,
     value_column: str | None = None,
+    decimal: str = ".",
 ) -> list[Recording]:
     """Reads recordings from CSV: a header, then one row per time, or one per measured value.
 
     A first column without a name that counts the rows, as pandas writes it, is left out. A unit in
     brackets after a name, as in `speed [m/s]`, is the channel's unit and no part of its name.
-    Times keep every digit down to the nanosecond. The file is read a mebibyte at a time.
+    Times keep every digit down to the nanosecond, as numbers and as texts of ISO 8601, whose clock
+    counts nanoseconds since 1970 (in UTC where they say their offset). The file is read a mebibyte
+    at a time.
 
     Args:
         path: the file, in UTF-8.
@@ -54,13 +62,14 @@ def read_csv(
         channels: the columns to read as channels (in the long form: their names in the column of
             channels), in the order wanted; by default all.
         time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's name says, else
-            found by the numbers, which is said aloud, else `s`.
+            found by the numbers, which is said aloud, else `s`. Times of ISO 8601 know theirs.
         units: unit of a channel by its name.
         delimiter: the character between two cells; by default a comma, or the semicolon or tab
             that the header has instead.
         channel_column: the column that says which channel a value is of, in the long form; by
             default found where the table has a `channel` and a `value` and nothing else.
         value_column: the column of values, in the long form.
+        decimal: what stands before the fraction of a number, `.` or `,`.
 
     Returns:
         A recording per trajectory, in the order of their first rows; a cell that is empty, or
@@ -77,7 +86,8 @@ def read_csv(
         raise InputError(
             f"delimiter must be one ASCII character, no quote or line end, got {delimiter!r}"
         )
-    file = _CsvFile(require_file(path), delimiter or ",")
+    one_of("decimal", decimal, (".", ","))
+    file = _CsvFile(require_file(path), delimiter or ",", decimal)
     if delimiter is None:
         file = file.with_delimiter_of_header()
     header = file.header()
@@ -92,10 +102,19 @@ def read_csv(
         channel_column=channel_column,
         value_column=value_column,
     )
-    numbers = [float(cell) for cell in sample[columns.time] if _is_number(cell)]
-    unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
+    unit = "ns"
+    notes: tuple[str, ...] = ()
+    if form_of(_first_time(sample, columns)) is None:
+        found = [file.number(cell) for cell in sample[columns.time]]
+        numbers = [number for number in found if number is not None]
+        unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
     if not header[0]:
         notes = (*notes, "the first column has no name and counts the rows; it is left out")
+    if not header[-1]:
+        notes = (
+            *notes,
+            "the last column has no name and no cell in the first lines; it is left out",
+        )
     table, counted_in = file.columns(header, sample, columns, unit)
     return recordings(file.path, columns, counted_in, notes, table, shown=unit)
 
@@ -106,6 +125,7 @@ class _CsvFile:
 
     path: Path
     delimiter: str
+    decimal: str
 
     def with_delimiter_of_header(self) -> _CsvFile:
         """The same file, with the delimiter that its header has."""
@@ -113,11 +133,11 @@ class _CsvFile:
         if len(cells) == 1:
             for delimiter in DELIMITERS[1:]:
                 if delimiter in cells[0]:
-                    return _CsvFile(self.path, delimiter)
+                    return replace(self, delimiter=delimiter)
         return self
 
     def header(self) -> list[str]:
-        """The column names, stripped; unique; the first may be empty, where it counts the rows."""
+        """The column names, stripped; unique; empty where one counts rows or ends all lines."""
         line, cells = next(self._lines(), (0, []))
         names = [cell.strip() for cell in cells]
         if line != 1:
@@ -129,7 +149,10 @@ class _CsvFile:
         if names[0] == "Unnamed: 0":
             names[0] = ""
         for i, name in enumerate(names):
-            if name in names[:i] or not (name or (i == 0 and self._counts_rows())):
+            unnamed = (i == 0 and self._counts_rows()) or (
+                i == len(names) - 1 and self._is_empty(i)
+            )
+            if (name in names[:i] and name) or not (name or unnamed):
                 fault = f"the column name {name!r} twice" if name else f"no name for column {i}"
                 raise FileFormatError(
                     f"{self.path} has {fault} in its first line, got {listed(names)}; "
@@ -141,6 +164,11 @@ class _CsvFile:
         cells = [line[0] for _, line in itertools.islice(self._lines(), 1, _SAMPLE)]
         first = int(cells[0]) if cells and cells[0].isdecimal() else 0
         return cells == [str(first + i) for i in range(len(cells))]
+
+    def _is_empty(self, place: int) -> bool:
+        """Whether a column holds nothing, in the first lines."""
+        lines = itertools.islice(self._lines(), 1, _SAMPLE)
+        return not any(cell.strip() for _, cells in lines for cell in cells[place:])
 
     def sample(self, header: list[str]) -> dict[str, list[str]]:
         """The cells of the first lines, by column."""
@@ -158,20 +186,27 @@ class _CsvFile:
         types |= {name: pa.string() for name in (columns.label, columns.key) if name}
         places = len(str(NANOSECONDS_PER[unit])) - 1
         clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
-        if not all(cell.lstrip("+-").isdecimal() for cell in sample[columns.time]):
+        if not all(
+            cell.isascii() and cell.lstrip("+-").isdecimal() for cell in sample[columns.time]
+        ):
             clocks = clocks[1:]
-        capacity = self._count_lines()
+        form = form_of(_first_time(sample, columns))
+        if form is not None:
+            clocks = [pa.string()]
+        lines = self._count_lines()
+        if lines < 2:
+            raise FileFormatError(f"{self.path} has a header and no rows, expected one per time")
+        require_rows(self.path, lines - 1, len(columns.channels))
         for clock in clocks:
+            batches = self._batches(header, columns, types | {columns.time: clock})
+            if form is not None:
+                batches = with_stamps(batches, columns.time, form, MISSING)
             try:
-                table = gather(
-                    self._batches(header, columns, types | {columns.time: clock}),
-                    columns,
-                    capacity,
-                )
+                table = gather(batches, columns, lines)
             except (pa.ArrowException, OverflowError) as error:
                 at = f"In CSV column #{header.index(columns.time)}:"
                 if clock is clocks[-1] or (at not in str(error) and clock is not clocks[0]):
-                    self._explain(header, columns)
+                    self._explain(header, columns, sample)
                     raise line_error(self.path, error) from None
                 continue
             except NullCellError as error:
@@ -192,19 +227,24 @@ class _CsvFile:
             read_options=pv.ReadOptions(column_names=names, skip_rows=1, block_size=_BLOCK),
             parse_options=pv.ParseOptions(delimiter=self.delimiter, newlines_in_values=True),
             convert_options=pv.ConvertOptions(
-                column_types=types, include_columns=columns.read, null_values=MISSING
+                column_types=types,
+                include_columns=columns.read,
+                null_values=(*MISSING, *_BLANK),
+                decimal_point=self.decimal,
             ),
         ) as reader:
             yield from reader
 
     def _count_lines(self) -> int:
-        """At least the number of rows."""
+        """Of the file, header included: at least the number of rows."""
         ends = returns = 0
+        last = b""
         with self.path.open("rb") as file:
             while block := file.read(_BLOCK):
                 ends += block.count(b"\n")
                 returns += block.count(b"\r") if not ends else 0
-        return max(ends, returns) + 1
+                last = block[-1:]
+        return max(ends, returns) + (last not in b"\r\n")
 
     def line_of(self, row: int) -> int:
         """The line in which a row of data ends, counted from 1; the header is line 1."""
@@ -222,9 +262,11 @@ class _CsvFile:
             f"must say which {what} it belongs to"
         )
 
-    def _explain(self, header: list[str], columns: Columns) -> None:
+    def _explain(self, header: list[str], columns: Columns, sample: dict[str, list[str]]) -> None:
         """Raises an error that names the line and column at fault, if one can be found."""
-        numeric = [columns.time, *columns.channels]
+        first = _first_time(sample, columns)
+        form = form_of(first)
+        truths = [name for name in columns.channels if _holds_booleans(sample[name])]
         for line, cells in self._lines():
             if len(cells) != len(header):
                 raise FileFormatError(
@@ -232,11 +274,37 @@ class _CsvFile:
                     f"one per column: {listed(header)}"
                 )
             for name, cell in zip(header, cells, strict=True):
-                if line > 1 and name in numeric and cell not in MISSING and not _is_number(cell):
+                if line == 1 or name not in columns.read or cell in MISSING or not cell.strip():
+                    continue
+                number = self.number(cell)
+                comma = number is None and self.decimal == "." and _COMMA.fullmatch(cell.strip())
+                if name in (columns.time, *columns.channels) and comma:
+                    expected = "a number; if its comma is a decimal point, say so with decimal=','"
+                elif name == columns.time:
+                    fits = number is not None if form is None else form_of(cell.strip()) == form
+                    expected = "" if fits else expected_after(first)
+                elif name in truths:
+                    expected = "" if cell in _BOOLEANS else f"one of {', '.join(_BOOLEANS)}"
+                elif name in columns.channels and number is None:
+                    expected = "a number; choose the columns that are channels with channels="
+                else:
+                    continue
+                if expected:
                     raise FileFormatError(
-                        f"{self.path} has {cell!r} in line {line}, column {name!r}, expected a "
-                        "number; choose the columns that are channels with channels="
+                        f"{self.path} has {cell!r} in line {line}, column {name!r}, expected "
+                        f"{expected}"
                     )
+
+    def number(self, cell: str) -> float | None:
+        """The number in a cell, or None."""
+        if self.decimal != ".":
+            cell = cell.replace(".", "?").replace(self.decimal, ".")
+        try:
+            number = float(cell)
+        except ValueError:
+            return None
+        # Python allows _ between digits, and digits of other scripts, and nobody else does.
+        return number if cell.isascii() and "_" not in cell else None
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
         """Line numbers and cells, header included; empty lines are skipped, as pyarrow does."""
@@ -252,17 +320,18 @@ class _CsvFile:
             ) from None
 
 
+def _first_time(sample: dict[str, list[str]], columns: Columns) -> str:
+    """The first cell of the clock that says something, or nothing."""
+    return next((cell for cell in sample[columns.time] if cell not in MISSING), "")
+
+
 def _type_of(cells: list[str]) -> Any:
     """The Arrow type of a channel by its first cells: booleans by name, else numbers."""
     import pyarrow as pa
 
+    return pa.bool_() if _holds_booleans(cells) else pa.float64()
+
+
+def _holds_booleans(cells: list[str]) -> bool:
     known = [cell for cell in cells if cell not in MISSING]
-    return pa.bool_() if known and all(c in _BOOLEANS for c in known) else pa.float64()
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return "_" not in cell  # which Python allows between digits, and nobody else
+    return bool(known) and all(cell in _BOOLEANS for cell in known)
