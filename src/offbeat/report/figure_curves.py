@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_CHOSEN = "#595959"
 _PANELS = {"published": "Published scoring", "honest": "Honest scoring"}
 
 
 def curves_figure(record: Record, fraction: float) -> Figure:
     """Validation MSE by epoch, all models of the thesis, published and honest scoring.
 
-    Hollow markers are the thesis' tables 3.1 to 3.4; a dashed line is the last-value predictor.
+    Hollow markers are the thesis' tables 3.1 to 3.4; a dashed line is the last-value
+    predictor, a vertical one the number of epochs that the thesis chose.
 
     Args:
         record: its runs of experiment 1, with their curves.
@@ -62,6 +64,11 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             axes.set_title(title, loc="left")
             plain_ticks(axes.yaxis, axes.get_ylim())
         _thesis_points(panels[0], fraction)
+        chosen = thesis.CHOSEN_EPOCHS[fraction]
+        for axes in panels:
+            axes.axvline(
+                chosen, color=_CHOSEN, linewidth=0.8, label=f"{chosen} epochs, the thesis' choice"
+            )
         rows = record.where(experiment=1, fraction=fraction)
         last, style = record.values("last_value_honest_mse", rows)[0], style_of("last_value")
         panels[1].axhline(
@@ -107,6 +114,6 @@ def _thesis_points(axes: Axes, fraction: float) -> None:
         marker="o",
         markersize=4,
         markerfacecolor="none",
-        markeredgecolor="#595959",
+        markeredgecolor=_CHOSEN,
         label="Thesis, in its model's colour",
     )

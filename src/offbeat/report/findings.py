@@ -26,10 +26,12 @@ class Verdict:
     Attributes:
         word: `HOLDS`, `PARTLY`, `FAILS`, `UNDECIDED`, `NOT_CONTRADICTED` or `MISSING`.
         evidence: sentences, each with its numbers.
+        count: how many parts of the claim hold; empty where it has but one.
     """
 
     word: str
     evidence: tuple[str, ...]
+    count: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,31 @@ def all_better(pairs: Sequence[Pair]) -> Verdict:
         f"worse, {len(tested) - better - worse} do not tell the two apart"
         + (f", {len(pairs) - len(tested)} cannot be made yet." if len(tested) < len(pairs) else ".")
     )
-    return Verdict(word(len(pairs), len(tested), better, worse), (count, *map(sentence, pairs)))
+    return judged(len(pairs), len(tested), better, worse, (count, *map(sentence, pairs)))
+
+
+def judged(
+    asked: int, tested: int, right: int, wrong: int, evidence: Sequence[str], parts: str = "parts"
+) -> Verdict:
+    """The verdict on a claim of several parts.
+
+    Args:
+        asked: how many parts it has.
+        tested: how many of them the record lets us test.
+        right: how many tests bear it out.
+        wrong: how many contradict it.
+        evidence: sentences.
+        parts: what they are called.
+    """
+    if tested < asked:
+        count = f"{tested} of {asked} {parts} can be tested"
+    else:
+        undecided = asked - right - wrong
+        said = [f"{right} of {asked} {parts}"]
+        said += [f"{wrong} against"] if wrong else []
+        said += [f"{undecided} not decided"] if undecided else []
+        count = ", ".join(said)
+    return Verdict(word(asked, tested, right, wrong), tuple(evidence), count if asked > 1 else "")
 
 
 def word(asked: int, tested: int, right: int, wrong: int) -> str:
@@ -127,7 +153,7 @@ def directions(pairs: Sequence[Pair], expected: Mapping[float, int]) -> Verdict:
     tested = [p for p in chosen if p.result is not None]
     right = sum(p.better if expected[p.fraction] < 0 else p.worse for p in tested)
     wrong = sum(p.worse if expected[p.fraction] < 0 else p.better for p in tested)
-    return Verdict(word(len(chosen), len(tested), right, wrong), tuple(map(sentence, chosen)))
+    return judged(len(chosen), len(tested), right, wrong, tuple(map(sentence, chosen)))
 
 
 def significance(pairs: Sequence[Pair], better_at: Sequence[float]) -> Verdict:
@@ -135,7 +161,7 @@ def significance(pairs: Sequence[Pair], better_at: Sequence[float]) -> Verdict:
     tested = [p for p in pairs if p.result is not None]
     right = sum(p.better if p.fraction in better_at else not p.significant for p in tested)
     wrong = len(tested) - right
-    return Verdict(word(len(pairs), len(tested), right, wrong), tuple(map(sentence, pairs)))
+    return judged(len(pairs), len(tested), right, wrong, tuple(map(sentence, pairs)))
 
 
 def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verdict:
@@ -167,7 +193,7 @@ def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verd
             f"{names.get(result.test, result.test)}, which {outcome} ({p_text(result.p)})."
             f"{normal}"
         )
-    return Verdict(word(len(rules), tested, right, tested - right), tuple(said))
+    return judged(len(rules), tested, right, tested - right, said)
 
 
 def no_difference(pairs: Sequence[Pair]) -> Verdict:

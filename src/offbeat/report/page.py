@@ -176,6 +176,8 @@ def finding(one: Finding) -> str:
     lines = []
     for decided_by, verdict in one.verdicts.items():
         word = f'<span class="verdict {_CLASSES[verdict.word]}">{text(verdict.word)}</span>'
+        if verdict.count:
+            word += f" ({text(verdict.count)})"
         evidence = "".join(f"<li>{text(s)}</li>" for s in verdict.evidence)
         lines.append(
             f"<details><summary>{text(decided_by)}: {word}</summary><ul>{evidence}</ul></details>"

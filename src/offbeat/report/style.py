@@ -101,17 +101,20 @@ RC: dict[Any, Any] = {
 """Settings of matplotlib, in force only while a figure is made or saved."""
 
 
-def plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
+def plain_ticks(axis: Any, limits: tuple[float, float], *, times: float = 1.0) -> None:
     """A few labels on a logarithmic axis, in plain numbers, also within one decade.
 
     Args:
         axis: of matplotlib.
         limits: between which it is seen.
+        times: labels are the values times this; the name of the axis has to say so.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     decades = math.log10(limits[1] / limits[0])
     steps = (1.0,) if decades > 2.5 else (1.0, 2.0, 5.0) if decades > 0.7 else (1, 1.5, 2, 3, 5, 7)
     axis.set_major_locator(LogLocator(subs=steps))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.7f}".rstrip("0")))
+    axis.set_major_formatter(
+        FuncFormatter(lambda value, _: f"{times * value:.7f}".rstrip("0").rstrip("."))
+    )
     axis.set_minor_formatter(NullFormatter())

@@ -125,6 +125,7 @@ class Table:
             r"  \centering",
             rf"  \caption{{{_latex(self.caption)}}}",
             rf"  \label{{tab:{self.slug.removeprefix('table-')}}}",
+            r"  \small",
             rf"  \begin{{tabular}}{{l{'r' * len(self.columns)}}}",
             r"    \toprule",
             "    " + " & ".join(_latex(c) for c in (self.corner, *self.columns)) + r" \\",

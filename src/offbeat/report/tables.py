@@ -30,7 +30,8 @@ _MIXED_NOTE = (
 _BOLD_NOTE = "Bold: the lowest of its column within a block."
 
 _MSE_DIGITS = {"published": 5, "honest": 6}
-_RMSE_DIGITS = 4
+_RMSE_DIGITS = {"published": 4, "honest": 5, "honest_hidden": 5}
+"""As the thesis prints them, and one more where errors are smaller."""
 
 
 def percent(fraction: float) -> str:
@@ -245,7 +246,9 @@ def rmse_rows(
         cells = []
         for fraction in thesis.FRACTIONS:
             runs, values = rmse_of(record, model, fraction, scoring)
-            cells.append(mean_cell(record, values, runs, digits=_RMSE_DIGITS, expected=repeats))
+            cells.append(
+                mean_cell(record, values, runs, digits=_RMSE_DIGITS[scoring], expected=repeats)
+            )
         rows.append((label(model), cells))
     return rows
 
@@ -264,12 +267,13 @@ def rmse_of(
 
 def missing_runs(record: Record, experiment: int, models: Sequence[str], repeats: int) -> str:
     """A sentence on the runs that the record lacks; empty where it lacks none."""
-    lacking = []
+    counted = 0
     for model in models:
         for fraction in thesis.FRACTIONS:
             there = len(record.where(experiment=experiment, model=model, fraction=fraction))
-            if there < repeats:
-                lacking.append(f"{label(model)} at {percent(fraction)}: {there} of {repeats}")
-    if not lacking:
+            counted += min(there, repeats)
+    asked = len(models) * len(thesis.FRACTIONS) * repeats
+    if counted == asked:
         return ""
-    return f"Not all runs of experiment {experiment} are there. " + "; ".join(lacking) + "."
+    how = "a cell says how many it has; a dash: none" if repeats > 1 else "a dash: not there yet"
+    return f"{counted} of {asked} runs of experiment {experiment} are there: {how}."
