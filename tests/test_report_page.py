@@ -306,7 +306,7 @@ def test_the_map_has_a_panel_per_model_and_a_scale_with_a_unit():
     figure = map_figure(drawn().map)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles[:3] == ["GRU", "ODE-RNN", "ODE-GRU-D"]
-    assert figure.axes[-1].get_ylabel() == "rootz_qpos (m)"
+    assert figure.axes[-1].get_ylabel() == "Height of the torso (m)"
 
 
 def test_two_channels_are_drawn_for_each_recording():

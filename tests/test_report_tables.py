@@ -147,15 +147,15 @@ def test_a_row_of_the_wrong_length_is_refused():
 def test_the_lowest_of_a_column_is_bold_and_so_is_what_prints_alike():
     rows = bold_lowest(
         [
-            ("a", [Cell("0.0100 ± 0.0010", 0.01001), Cell()]),
-            ("b", [Cell("0.0100 ± 0.0020", 0.01004), Cell("3", 3.0)]),
-            ("c", [Cell("0.0101 ± 0.0001", 0.01006), Cell("4", 4.0)]),
+            ("a", [Cell("0.0100 ± 0.0010", 0.01001), Cell("5", 5.0), Cell()]),
+            ("b", [Cell("0.0100 ± 0.0020", 0.01004), Cell("3", 3.0), Cell("3", 3.0)]),
+            ("c", [Cell("0.0101 ± 0.0001", 0.01006), Cell("4", 4.0), Cell("4", 4.0)]),
         ]
     )
     assert [[cell.bold for cell in cells] for _, cells in rows] == [
-        [True, False],
-        [True, True],
-        [False, False],
+        [True, False, False],
+        [True, True, False],  # the last column lacks a number, and has no best one yet
+        [False, False, False],
     ]
 
 

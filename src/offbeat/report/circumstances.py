@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
 from pathlib import Path
@@ -37,7 +38,7 @@ class Circumstances:
         protocol: the fields of the protocol; empty where the folder has none.
         sittings_s: s, wall time of all sittings together; None where it was not kept.
         sittings: how many there were.
-        engines: what ran them.
+        engines: what ran them, each once, that of the last sitting last.
         commands: what was typed.
         machine: names and values of what the record itself does not hold.
     """
@@ -70,7 +71,7 @@ class Circumstances:
             _mapping(_json(folder / "protocol.json")) or _mapping(about.get("protocol")),
             float(sum(known)) if known and len(known) == len(spent) else None,
             len(sittings),
-            tuple(dict.fromkeys(str(one["engine"]) for one in sittings if "engine" in one)),
+            _last_of_each(str(one["engine"]) for one in sittings if "engine" in one),
             tuple(" ".join(map(str, c)) for c in typed if isinstance(c, list))
             if isinstance(typed, list)
             else (),
@@ -82,6 +83,12 @@ class Circumstances:
         """Of experiment 2 in the full protocol."""
         said = self.protocol.get("repeats")
         return said if isinstance(said, int) and said >= 1 else thesis.REPEATS
+
+    @property
+    def processes(self) -> int | None:
+        """Runs at a time of the last sitting, where its engine says so."""
+        found = re.match(r"(\d+) process", self.engines[-1]) if self.engines else None
+        return int(found[1]) if found and int(found[1]) else None
 
     @property
     def departures(self) -> tuple[str, ...]:
@@ -98,6 +105,10 @@ class Circumstances:
             "This is not the thesis' protocol, and its numbers are not to be compared with the "
             f"thesis': {'; '.join(other)}.",
         )
+
+
+def _last_of_each(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(reversed(dict.fromkeys(reversed(list(names)))))
 
 
 def _json(path: Path) -> Any:
@@ -179,7 +190,8 @@ class TimeLeft:
     Attributes:
         runs: how many are missing.
         run_s: s, the sum of their run times: epochs times what an epoch of the model took so far.
-        at_a_time: runs that went at a time so far, on average over the time in which any did.
+        at_a_time: processes of the last sitting, or runs that went at a time so far, on average
+            over the time in which any did.
         guessed: models without a finished run; an epoch of theirs is taken to cost as much as the
             mean of all others.
     """
@@ -190,16 +202,16 @@ class TimeLeft:
     guessed: tuple[str, ...] = ()
 
 
-def time_left(record: Record, protocol: Mapping[str, Any]) -> TimeLeft | None:
+def time_left(record: Record, circumstances: Circumstances) -> TimeLeft | None:
     """Estimates the time of the runs that a record lacks; None where it lacks none.
 
     Args:
         record: finished runs.
-        protocol: its fields; what is missing is the thesis'.
+        circumstances: know the protocol, or it is the thesis', and what ran it.
     """
     known = {f.name for f in fields(Protocol)}
     try:
-        whole = Protocol(**{name: v for name, v in protocol.items() if name in known})
+        whole = Protocol(**{name: v for name, v in circumstances.protocol.items() if name in known})
     except (OffbeatError, TypeError, ValueError):  # of another version, or damaged
         return None
     there = set(record.runs["run_id"].tolist())
@@ -217,7 +229,7 @@ def time_left(record: Record, protocol: Mapping[str, Any]) -> TimeLeft | None:
     return TimeLeft(
         len(missing),
         sum(each.get(run.model, usual) * run.epochs for run in missing),
-        float(seconds.sum() / (3600 * covered)) if covered else None,
+        circumstances.processes or (float(seconds.sum() / (3600 * covered)) if covered else None),
         tuple(dict.fromkeys(run.model for run in missing if run.model not in each)),
     )
 
@@ -245,7 +257,7 @@ def time_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, 
         facts.append(("Ran by", "; ".join(circumstances.engines)))
     ended = sorted(str(t) for t in record.runs["finished_at"])
     facts += [("First run finished", ended[0]), ("Last run finished", ended[-1])]
-    left = time_left(record, circumstances.protocol)
+    left = time_left(record, circumstances)
     if left is not None:
         facts += _left_facts(left, float(seconds.sum()))
     return facts
@@ -255,7 +267,7 @@ def _left_facts(left: TimeLeft, spent: float) -> list[tuple[str, str]]:
     said = f"{left.runs} runs, about {hours(left.run_s)} of run time"
     total = f"about {hours(spent + left.run_s)} of run time"
     if left.at_a_time:
-        pace = f"at {left.at_a_time:.1f} runs at a time"
+        pace = f"at {left.at_a_time:.2g} runs at a time"
         said += f", {hours(left.run_s / left.at_a_time)} of wall time {pace}"
         total += f", {hours((spent + left.run_s) / left.at_a_time)} of wall time {pace}"
     basis = "what an epoch of each model has taken so far"

@@ -191,7 +191,8 @@ class Contents:
         return Picture(
             number,
             f"Learning curves of one run per model, {at} of the rows observed; axes are "
-            f"logarithmic. Hollow markers: the thesis' table {thesis.CURVE_TABLES[fraction]}.",
+            "logarithmic, and the first epochs may lie above them. Hollow markers: the thesis' "
+            f"table {thesis.CURVE_TABLES[fraction]}.",
             f"Validation MSE by epoch at {at}, two panels: published and honest scoring. At the "
             f"last epoch: {'; '.join(ends)}.",
             curves_figure(self.record, fraction),

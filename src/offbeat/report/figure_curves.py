@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from offbeat.errors import InputError
 from offbeat.report import thesis_numbers as thesis
@@ -16,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CHOSEN = "#595959"
+_CUT = 10
+"""Epochs that may lie above a panel, of curves ten times as long."""
 _PANELS = {"published": "Published scoring", "honest": "Honest scoring"}
 
 
@@ -47,7 +53,7 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             "need one"
         )
     with rc_context(RC):
-        figure = Figure(figsize=(COLUMN_WIDTH, 4.6), layout="constrained")
+        figure = Figure(figsize=(COLUMN_WIDTH, 5.2), layout="constrained")
         panels = figure.subplots(2, sharex=True)
         for axes, (scoring, title) in zip(panels, _PANELS.items(), strict=True):
             for model, curve in curves.items():
@@ -62,13 +68,10 @@ def curves_figure(record: Record, fraction: float) -> Figure:
                 )
             axes.set_yscale("log")
             axes.set_title(title, loc="left")
-            plain_ticks(axes.yaxis, axes.get_ylim())
         _thesis_points(panels[0], fraction)
         chosen = thesis.CHOSEN_EPOCHS[fraction]
         for axes in panels:
-            axes.axvline(
-                chosen, color=_CHOSEN, linewidth=0.8, label=f"{chosen} epochs, the thesis' choice"
-            )
+            axes.axvline(chosen, color=_CHOSEN, linewidth=0.8, label=f"Thesis' choice, {chosen}")
         rows = record.where(experiment=1, fraction=fraction)
         last, style = record.values("last_value_honest_mse", rows)[0], style_of("last_value")
         panels[1].axhline(
@@ -77,6 +80,9 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             linestyle=style.dash,
             label=f"{style.label} (test part)",
         )
+        for axes, scoring in zip(panels, _PANELS, strict=True):
+            axes.set_ylim(top=_top(curves.values(), f"validation_{scoring}_mse"))
+            plain_ticks(axes.yaxis, axes.get_ylim())
         figure.supylabel("Validation MSE (scaled units)", fontsize=RC["axes.labelsize"])
         panels[-1].set_xlabel("Epoch")
         panels[-1].set_xlim(left=0)
@@ -90,6 +96,14 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             ncols=2,
         )
     return figure
+
+
+def _top(curves: Iterable[Mapping[str, NDArray[np.float64]]], column: str) -> float | None:
+    """Where a panel ends: what is above in the first epochs would press all else together."""
+    found = [curve[column] for curve in curves]
+    if min(map(len, found)) < 10 * _CUT:
+        return None
+    return 1.1 * max(float(values[_CUT - 1]) for values in found)
 
 
 def _thesis_points(axes: Axes, fraction: float) -> None:
@@ -115,5 +129,5 @@ def _thesis_points(axes: Axes, fraction: float) -> None:
         markersize=4,
         markerfacecolor="none",
         markeredgecolor=_CHOSEN,
-        label="Thesis, in its model's colour",
+        label="Thesis, by colour",
     )

@@ -121,7 +121,7 @@ def judged(
         parts: what they are called.
     """
     if tested < asked:
-        count = f"{tested} of {asked} {parts} can be tested"
+        count = f"{tested} of {asked} {parts} can be tested yet"
     else:
         undecided = asked - right - wrong
         said = [f"{right} of {asked} {parts}"]

@@ -12,7 +12,7 @@ from offbeat.errors import InputError
 from offbeat.report import findings as say
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.findings import Verdict
-from offbeat.report.pairing import MODELS, Pair, corrected, paired_rmse
+from offbeat.report.pairing import MODELS, Pair, corrected, paired_rmse, too_few
 from offbeat.report.records import Record
 from offbeat.report.statistics import (
     SpreadComparison,
@@ -63,7 +63,12 @@ def speed_pairs(record: Record, scoring: str) -> tuple[Pair, ...]:
             [settling(curves[r], tolerance=TOLERANCE).settled for r in shared]
             for curves in (ours, other)
         )
-        pair = Pair(_OURS, _OTHER, fraction, scoring, measure="epochs")
+        pair = Pair(
+            _OURS, _OTHER, fraction, scoring, measure="epochs", missing=too_few(len(shared))
+        )
+        if pair.missing:
+            pairs.append(pair)
+            continue
         try:
             result = paired_comparison(a, b, names=(label(_OURS), label(_OTHER)))
             pairs.append(replace(pair, result=result))
@@ -369,7 +374,9 @@ def _p(one: Spread) -> float | None:
 
 def _spread(record: Record, model: str, fraction: float, scoring: str) -> Spread:
     ours, other = paired_rmse(record, _OURS, model, fraction, scoring)
-    one = Spread(model, fraction, scoring)
+    one = Spread(model, fraction, scoring, missing=too_few(len(ours)))
+    if one.missing:
+        return one
     try:
         return replace(
             one, result=spread_comparison(ours, other, names=(label(_OURS), label(model)))

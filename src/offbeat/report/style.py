@@ -43,12 +43,12 @@ STYLES: dict[str, Style] = {
     "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),
     "ode_gru_d": Style("ODE-GRU-D", "#0072B2", "D", (0, (6, 1.2, 1, 1.2, 1, 1.2))),
     "anchored_ode_gru_d": Style("Anchored ODE-GRU-D", "#D55E00", "o"),
-    "rnn_decay": Style("RNN-Decay", "#CC79A7", "v", _DASH_DOT),
-    "rnn": Style("RNN", "#999933", "P", _DOTTED),
+    "rnn_decay": Style("RNN-Decay", "#AA4499", "v", _DASH_DOT),
+    "rnn": Style("RNN", "#DDCC77", "P", _DOTTED),
     "lstm": Style("LSTM", "#332288", "X", _DOTTED),
     "neural_ode": Style("Neural ODE", "#882255", "*", _DASHED),
-    "gru_fair": Style("Fair GRU", "#AA4499", "o", _DOTTED),
-    "gru_d_fair": Style("Fair GRU-D", "#DDCC77", "s", _DASH_DOT),
+    "gru_fair": Style("Fair GRU", "#CC79A7", "o", _DOTTED),
+    "gru_d_fair": Style("Fair GRU-D", "#999933", "s", _DASH_DOT),
 }
 """The styles by id of the model; `truth` and `last_value` stand beside them."""
 

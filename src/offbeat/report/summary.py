@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -90,15 +90,11 @@ def _missing(contents: Contents) -> str:
                 for f in thesis.FRACTIONS
             ]
             if min(there) < asked:
-                lacking[label(model)] = ", ".join(map(str, there))
-        same = dict[str, list[str]]()
-        for name, counts in lacking.items():
-            same.setdefault(counts, []).append(name)
-        if same:
-            each = "; ".join(f"{', '.join(names)}: {counts}" for counts, names in same.items())
-            said.append(f"experiment {experiment} (of {asked} per model and share) {each}")
+                lacking[label(model)] = ", ".join(map(str, there)) if any(there) else "none"
+        if lacking:
+            said.append(f"Experiment {experiment}, of {asked} each: {_grouped(lacking)}.")
     shares = ", ".join(_COLUMNS)
-    return f"Runs there at {shares}: {'. '.join(said)}." if said else ""
+    return f"Runs that are there, at {shares}. {' '.join(said)}" if said else ""
 
 
 def _conclusions(contents: Contents) -> Iterable[str]:
@@ -117,8 +113,7 @@ def _conclusions(contents: Contents) -> Iterable[str]:
         if any(scored.values()):
             rows.append((finding.claim, finding.source, *map("; ".join, scored.values())))
         else:  # judged per model, under honest scoring
-            words = "; ".join(f"{name}: {verdict}" for name, verdict in by.items())
-            rows.append((finding.claim, finding.source, DASH, words))
+            rows.append((finding.claim, finding.source, DASH, _grouped(by)))
     yield _grid(("Claim", "Source", *claims.SCORINGS.values()), rows)
     yield (
         "Verdicts follow from paired tests; 'the thesis' rule' is its own choice of tests, which "
@@ -232,19 +227,19 @@ def _differences(contents: Contents) -> Iterable[str]:
 
 def _convergence(contents: Contents) -> Iterable[str]:
     yield "## Convergence"
-    yield from _verdicts(contents, "2", "tests")
+    yield from _verdicts(contents, "2", evidence=True)
     yield _embedded(contents.tables["A.12"])
-    yield from _verdicts(contents, "3.2", "")
+    yield from _verdicts(contents, "3.2", evidence=False)
     yield _embedded(contents.tables["A.13"])
     yield _source("`tables/table-a-12.csv`, `tables/table-a-13.csv`; curves in `curves.csv`")
 
 
-def _verdicts(contents: Contents, number: str, evidence: str) -> Iterable[str]:
+def _verdicts(contents: Contents, number: str, *, evidence: bool) -> Iterable[str]:
     (finding,) = [f for f in contents.findings if f.claim == thesis.CONCLUSIONS[number]]
     yield f"### {finding.claim.rstrip('.')}?"
     for shown, verdict in finding.verdicts.items():
         yield f"{shown}: **{_verdict(verdict)}**."
-        if evidence:
+        if evidence and not (verdict.word == say.MISSING and verdict.count.startswith("0 of")):
             yield "\n".join(f"- {sentence}" for sentence in verdict.evidence)
 
 
@@ -301,6 +296,14 @@ def _verdict(verdict: say.Verdict) -> str:
     return f"{verdict.word} ({verdict.count})" if verdict.count else verdict.word
 
 
+def _grouped(words: Mapping[str, str]) -> str:
+    """Names that share what is said of them, said once."""
+    names = dict[str, list[str]]()
+    for name, said in words.items():
+        names.setdefault(said, []).append(name)
+    return "; ".join(f"{', '.join(each)}: {said}" for said, each in names.items())
+
+
 def _by_key(contents: Contents, name: str, scoring: str) -> dict[tuple[str, str, float], Pair]:
     return {(p.a, p.b, p.fraction): p for p in contents.families[name, scoring]}
 
@@ -334,12 +337,17 @@ def _bold(text: str, bold: bool) -> str:
 
 
 def _grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    rows = list(rows)
+    if all(cell == DASH for row in rows for cell in row[1:]):
+        return f"{head[0]}: {say.MISSING}, runs are missing."
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join(lines)
 
 
 def _embedded(table: Table) -> str:
+    if all(c.value is None for block in table.blocks for _, cells in block.rows for c in cells):
+        return f"Table {table.number}: {say.MISSING}, runs are missing."
     return table.to_markdown().strip()
 
 

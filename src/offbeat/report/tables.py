@@ -27,7 +27,7 @@ _MIXED_NOTE = (
     f"{MIXED} The runs behind the number were not made alike (code, processor, kernel body, torch "
     "or data); machine and versions are listed below."
 )
-_BOLD_NOTE = "Bold: the lowest of its column within a block."
+_BOLD_NOTE = "Bold: the lowest of its column within a block, where all are there."
 
 _MSE_DIGITS = {"published": 5, "honest": 6}
 _RMSE_DIGITS = {"published": 4, "honest": 5, "honest_hidden": 5}

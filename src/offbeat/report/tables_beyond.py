@@ -40,8 +40,8 @@ def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
         notes(
             record,
             blocks,
-            "Bold: the lowest of its column within a block. Fair: without self-feeding, updated at "
-            "every row, GRU with the age of each channel as input.",
+            "Bold: the lowest of its column within a block, where all are there. Fair: without "
+            "self-feeding, updated at every row, GRU with the age of each channel as input.",
             missing_runs(record, 2, MODELS, repeats),
         ),
     )
