@@ -98,6 +98,22 @@ def test_what_is_inferred_is_called_so_and_commands_are_there(text):
     assert "/work" not in text
 
 
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("results/thesis", "results/thesis"),
+        ("/home/someone/runs", "runs/thesis"),
+        ("../elsewhere", "runs/thesis"),
+        ("the record", "runs/thesis"),
+    ],
+)
+def test_the_command_names_the_folder_of_the_record_and_no_path_of_a_machine(source, said):
+    record = made.synthetic(repeats=1, epochs=2, fractions=(0.9,), experiments=(2,))
+    text = summary(contents_of(made.Record(record.runs, record.curves, source), repeats=10))
+    assert f"offbeat report {said} --out runs/report --summary" in text
+    assert "someone" not in text
+
+
 # --- a part of one --------------------------------------------------------------------------------
 
 
@@ -195,7 +211,7 @@ def test_when_one_model_is_as_good_as_the_other_becomes_is_told(falling):
 
 
 def test_the_margin_that_the_constant_leaves_is_told(falling):
-    note = stability.speed_table(falling, number="A.12").notes[-1]
+    note = stability.speed_table(falling, number="A.12").notes[-2]
     at = falling.where(experiment=2, model="ode_gru_d", fraction=0.9)
     share = made.CONSTANT * 0.1 / 100 / falling.values("published_mse", at).mean()
     assert f"{100 * share:.0f}{PERCENT} at 90{PERCENT}" in note
@@ -264,6 +280,7 @@ def test_several_sittings_of_several_processes_are_added_up(tmp_path):
 # --- files ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_document_where_it_is_told(tmp_path, capsys):
     record = made.synthetic(repeats=1, epochs=2, fractions=(0.9,), experiments=(2,))
     two = made.without(record, np.arange(len(record)) > 1)

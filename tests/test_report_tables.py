@@ -205,7 +205,7 @@ def test_missing_repeats_are_counted_in_the_cell_and_named_below(record):
     block = rows_of(table, "Ours, honest scoring")
     assert block["GRU"][0].text.endswith(" (4 of 6)")
     assert [cell.text for cell in block["GRU-D"]] == ["–"] * 4
-    (note,) = [n for n in table.notes if "are there" in n]
+    (note,) = [n for n in table.notes if "runs of experiment 2 are there" in n]
     assert note.startswith("64 of 96 runs of experiment 2")  # 4 models, 4 shares, 6 repeats
     runs = tables_beyond.runs_table(made.without(record, gone), repeats=6, number="A.14")
     counts = rows_of(runs, "Experiment 2")

@@ -322,11 +322,12 @@ def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
         )
     if shown.map is not None:
         names = ", ".join(map(label, shown.map.places))
+        colour = CHANNELS.get(shown.map.name, shown.map.name).lower()
         pictures.append(
             Picture(
                 "A.2",
                 "Hidden states on trajectories that no model was trained on, laid out by UMAP for "
-                f"each model on its own; {at} of the rows observed. Colour: {shown.map.name}. "
+                f"each model on its own; {at} of the rows observed. Colour: {colour}. "
                 f"Distances between far groups mean nothing. {_trained(shown)}",
                 f"One scatter plot per model: {names}.",
                 map_figure(shown.map),

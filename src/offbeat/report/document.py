@@ -11,7 +11,7 @@ from offbeat.report.tables_beyond import constant_residual
 TITLE = "ODE-GRU-D on irregularly sampled robot motion: the thesis, reproduced"
 
 _REPRODUCE = "offbeat reproduce --out runs/thesis"
-_REPORT = "offbeat report runs/thesis --out REPORT"
+_REPORT = "offbeat report {} --out runs/report"
 
 _ROUNDING = 1e-5
 """Scores are sums in single precision."""
@@ -155,6 +155,7 @@ def _pictures(contents: Contents) -> tuple[str, str, str]:
 
 def _method(contents: Contents) -> tuple[str, str, str]:
     record = contents.record
+    report = _REPORT.format(record.folder or "runs/thesis")
     return page.section(
         "method",
         "How it was made",
@@ -166,7 +167,7 @@ def _method(contents: Contents) -> tuple[str, str, str]:
         else page.paragraph(
             "The folder of the record does not hold what was typed; the full protocol is run by:"
         ),
-        page.commands((*(contents.circumstances.commands or (_REPRODUCE,)), _REPORT)),
+        page.commands((*(contents.circumstances.commands or (_REPRODUCE,)), report)),
         "<h3>Time</h3>",
         page.facts(time_facts(record, contents.circumstances)),
         *_tables(contents, "A.14", "A.15"),

@@ -60,6 +60,7 @@ class Pair:
         wilcoxon_holm: p of Wilcoxon's test, corrected for the family.
         missing: why there is no result.
         measure: `RMSE` or `epochs`; lower is better.
+        tied: both are equal in every repeat, so that there is no test and no difference.
     """
 
     a: str
@@ -71,6 +72,7 @@ class Pair:
     wilcoxon_holm: float | None = None
     missing: str = ""
     measure: str = "RMSE"
+    tied: bool = False
 
     @property
     def better(self) -> bool:

@@ -29,6 +29,7 @@ from offbeat.report.tables_tests import signed
 
 SCORINGS = {"published": "Published scoring", "honest": "Honest scoring"}
 _COLUMNS = tuple(map(percent, thesis.FRACTIONS))
+_COUNTED = "Table A.14 counts the runs behind a cell."
 _OURS, _OTHER = "ode_gru_d", "ode_rnn"
 TOLERANCE = 0.05
 """A run has settled when its validation MSE stays within this of its final one."""
@@ -68,6 +69,10 @@ def speed_pairs(record: Record, scoring: str) -> tuple[Pair, ...]:
         )
         if pair.missing:
             pairs.append(pair)
+            continue
+        if a == b:
+            why = f"they need the same epochs in all {len(shared)} repeats"
+            pairs.append(replace(pair, missing=why, tied=True))
             continue
         try:
             result = paired_comparison(a, b, names=(label(_OURS), label(_OTHER)))
@@ -280,6 +285,7 @@ def speed_table(record: Record, *, number: str) -> Table:
             "A run of experiment 2 is compared with its own end, at 75 or 50 epochs, where its "
             "error may still be falling: then the epoch says when training was stopped.",
             _diluted(record),
+            _COUNTED,
         ),
     )
 
@@ -467,5 +473,6 @@ def spread_table(record: Record, found: Mapping[str, tuple[Spread, ...]], *, num
             blocks,
             f"Below 1: {label(_OURS)} is steadier. Bold: Pitman and Morgan's test for pairs tells "
             f"the two apart (p ≤ {thesis.ALPHA:g} after Holm).",
+            _COUNTED,
         ),
     )

@@ -18,7 +18,8 @@ from offbeat.report.tables_beyond import constant_of
 from offbeat.report.tables_tests import p_cell, signed
 
 REPRODUCE = "offbeat reproduce --out runs/thesis"
-REPORT = "offbeat report runs/thesis --out runs/report"
+FOLDER = "runs/thesis"
+REPORT = f"offbeat report {FOLDER} --out runs/report"
 DOCUMENT = f"{REPORT} --summary docs/reproduction.md"
 
 _COLUMNS = tuple(map(percent, thesis.FRACTIONS))
@@ -54,7 +55,8 @@ def summary(contents: Contents) -> str:
         *_stability(contents),
         *_made(contents),
     ]
-    return "\n\n".join(filter(None, parts)) + "\n"
+    text = "\n\n".join(filter(None, parts)) + "\n"
+    return text.replace(REPORT, REPORT.replace(FOLDER, contents.record.folder or FOLDER))
 
 
 # --- parts ----------------------------------------------------------------------------------------

@@ -101,7 +101,6 @@ def curve_table(record: Record, fraction: float) -> Table:
             ),
         )
     ]
-    remarks = []
     for scoring in ("published", "honest"):
         digits = _MSE_DIGITS[scoring]
         rows = [(label(m), _epochs(record, m, fraction, scoring)) for m in thesis.MODELS]
@@ -110,15 +109,17 @@ def curve_table(record: Record, fraction: float) -> Table:
         cell = mean_cell(record, last, runs, digits=digits)
         rows.append((f"{label(LAST_VALUE)} (test part)", [cell] * len(thesis.EPOCHS)))
         blocks.append(Block(HEADINGS[scoring], bold_lowest(rows)))
+    ends = dict[str, list[str]]()
     for model in thesis.MODELS:
         runs = record.where(experiment=1, model=model, fraction=fraction)
         if not len(runs):
-            remarks.append(f"{label(model)}: no run of experiment 1 yet.")
+            ends.setdefault("no run of experiment 1 yet", []).append(label(model))
             continue
         curve = record.curve(str(record.values("run_id", runs)[0]))
         last_epoch = int(curve["epoch"][-1]) if len(curve["epoch"]) else 0
         if last_epoch < thesis.EPOCHS[-1]:
-            remarks.append(f"{label(model)}: the record's curve has {last_epoch} epochs.")
+            ends.setdefault(f"the curve has {last_epoch} epochs", []).append(label(model))
+    remarks = [f"{', '.join(models)}: {said}." for said, models in ends.items()]
     return Table(
         number,
         f"Validation MSE while training, {percent(fraction)} of the rows observed.",

@@ -235,7 +235,7 @@ def family_table(
             f"In brackets p of the paired t test, corrected by Holm within a block. Bold: p ≤ "
             f"{thesis.ALPHA:g}. Negative: the first is better.",
             _FAIR
-            if any(p.a in FAIR or p.b in FAIR for ps in families.values() for p in ps)
+            if all(p.a in FAIR or p.b in FAIR for ps in families.values() for p in ps)
             else "",
             f"Pairs without a number lack runs ({len(missing)})." if missing else "",
         ),
