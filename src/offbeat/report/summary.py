@@ -70,9 +70,9 @@ def _top(contents: Contents) -> str:
             f"What needs the other {asked - there} is left open: it reads '{say.MISSING}' or "
             f"'{DASH}'. {_missing(contents)}"
         )
-    lines += contents.faults
+    faults = f"{' '.join(contents.faults)}\n\n" if contents.faults else ""
     return (
-        f"{' '.join(lines)}\n\n"
+        f"{' '.join(lines)}\n\n{faults}"
         f"Made by `{DOCUMENT}` from the results that `report.html` shows, and not edited. Test "
         "errors in the thesis' scaled units. *Published* scoring is the thesis' own, *honest* "
         "counts the rows after the first observed one of their trajectory. Paired tests compare "
