@@ -33,7 +33,7 @@ _STYLE = """
 html{-webkit-text-size-adjust:100%}
 body{margin:0;background:var(--paper);color:var(--ink);
 font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,"Noto Sans",sans-serif}
-main,header,nav,footer{max-width:66rem;margin:0 auto;padding:0 1.1rem}
+main,header,nav,footer{max-width:67rem;margin:0 auto;padding:0 1.1rem}
 header{padding-top:2rem}
 h1{font-size:1.7rem;line-height:1.25;margin:0 0 .4rem}
 h2{font-size:1.3rem;margin:3rem 0 .6rem;padding-top:.6rem;border-top:1px solid var(--line)}
