@@ -2,12 +2,14 @@
 
 import re
 
+import numpy as np
 import pytest
 import record_helpers as made
 
 from offbeat.report import claims, findings, pairing, stability
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.findings import FAILS, HOLDS, MISSING, NOT_CONTRADICTED, PARTLY, UNDECIDED
+from offbeat.report.records import Record
 
 PERCENT = "\N{THIN SPACE}%"
 
@@ -91,6 +93,38 @@ def test_a_claim_about_significance_asks_for_it_there_and_nowhere_else(record):
     assert findings.significance(pairs, thesis.FRACTIONS).word == HOLDS
     assert findings.significance(pairs, (0.5, 0.3)).word == PARTLY
     assert findings.significance(pairs, ()).word == FAILS
+
+
+def test_tests_that_find_nothing_decide_nothing_about_significance():
+    # Claimed: a difference at two shares and none at two others. Nothing is found anywhere.
+    same = of(ode_gru_d=0.00073 / 0.00066)
+    verdict = findings.significance(pairing.family(same, "ode_models", "honest"), (0.5, 0.3))
+    assert verdict.word == UNDECIDED
+    assert verdict.count == "0 of 4 parts, 4 not decided"
+    rule = findings.rule_significance(pairing.thesis_rule(same, "honest"), (0.5, 0.3))
+    assert rule.word == UNDECIDED
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "expected"),
+    [
+        ([(True, True, False), (False, False, False)], (2, 0)),  # as claimed
+        ([(True, False, False), (False, False, False)], (0, 0)),  # nothing found
+        ([(True, True, False), (False, True, False)], (1, 1)),  # a difference too many
+        ([(True, False, True), (False, False, False)], (1, 1)),  # the other way round
+    ],
+)
+def test_a_claim_of_where_a_difference_is_needs_a_difference(outcomes, expected):
+    assert findings._exactly(outcomes) == expected
+
+
+def test_models_that_need_the_same_epochs_are_not_told_apart():
+    record = made.synthetic(repeats=4, epochs=2, fractions=thesis.FRACTIONS, experiments=(2,))
+    flat = {**record.curves, "validation_honest_mse": np.ones(len(record.curves["epoch"]))}
+    record = Record(record.runs, flat, "flat")
+    verdict = stability.speed_verdicts(record)["Honest scoring"]
+    assert verdict.word == UNDECIDED
+    assert "they need the same epochs in all 4 repeats" in verdict.evidence[1]
 
 
 def test_the_thesis_rule_is_told_step_by_step(record):

@@ -17,6 +17,7 @@ def report_command(
     out: Path = Path("runs/report"),
     observed_fraction: float = 0.3,
     illustrate: bool = True,
+    summary: Path | None = None,
     json: bool = False,
 ) -> None:
     """Write the thesis' tables, figures and tests beside those of a reproduction, as one page.
@@ -25,12 +26,13 @@ def report_command(
 
     Args:
         runs: folder of a reproduction, with record.parquet or record.csv.
-        out: folder for report.html, tables/ and figures/.
+        out: folder for report.html, summary.md, tables/ and figures/.
         observed_fraction: share of the rows at which hidden states are shown; the models are those
             of experiment 1 at this share, and of experiment 2 where experiment 1 has none.
         illustrate: where neither runs nor out has illustrations.npz of these models, make it in
             out, by simulation and from the checkpoints of the runs; needs the extra sim, and umap
             for the map of hidden states.
+        summary: where to write the answers as a Markdown document, in place of summary.md in out.
         json: print what was written as JSON.
     """
     from offbeat.experiment.illustrations import Illustrations
@@ -39,11 +41,13 @@ def report_command(
     from offbeat.report.reproduction import write_report
 
     writable(out, folder=True)
+    if summary is not None:
+        writable(summary)
     read_record(runs)  # before minutes go into anything else
     shown = Illustrations.load(runs) or Illustrations.load(out)
     if illustrate:
         shown = _illustrated(runs, out, observed_fraction, shown)
-    written = write_report(runs, out, illustrations=shown)
+    written = write_report(runs, out, illustrations=shown, summary=summary)
     say(written.to_dict(), str(written), json)
 
 

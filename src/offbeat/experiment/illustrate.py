@@ -83,7 +83,11 @@ def illustrate(
         np.stack([trajectory.values for trajectory in recorded]),
     )
     if not checkpoints:
-        return replace(kept, missing=("There is no checkpoint to take hidden states from.",))
+        said = (
+            "Hidden states (figures 2.5 and A.2) need trained models: there is no checkpoint of a "
+            f"first repeat at {100 * observed_fraction:g}\N{THIN SPACE}%."
+        )
+        return replace(kept, missing=(said,))
     fresh = simulate(robot, trajectories, recorded_rows, seed=fresh_seed, progress=progress)
     shown = thin(windows(fresh, window, seed=fresh_seed), observed_fraction, seed=fresh_seed)
     models = {label: load_checkpoint(path) for label, path in checkpoints.items()}

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from offbeat.errors import OffbeatError
 from offbeat.experiment.protocol import Protocol
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.records import PROVENANCE, Record
@@ -35,13 +37,15 @@ class Circumstances:
     Attributes:
         protocol: the fields of the protocol; empty where the folder has none.
         sittings_s: s, wall time of all sittings together; None where it was not kept.
-        engines: what ran them.
+        sittings: how many there were.
+        engines: what ran them, each once, that of the last sitting last.
         commands: what was typed.
         machine: names and values of what the record itself does not hold.
     """
 
     protocol: Mapping[str, Any] = field(default_factory=dict)
     sittings_s: float | None = None
+    sittings: int = 0
     engines: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
     machine: tuple[tuple[str, str], ...] = ()
@@ -66,7 +70,8 @@ class Circumstances:
         return cls(
             _mapping(_json(folder / "protocol.json")) or _mapping(about.get("protocol")),
             float(sum(known)) if known and len(known) == len(spent) else None,
-            tuple(dict.fromkeys(str(one["engine"]) for one in sittings if "engine" in one)),
+            len(sittings),
+            _last_of_each(str(one["engine"]) for one in sittings if "engine" in one),
             tuple(" ".join(map(str, c)) for c in typed if isinstance(c, list))
             if isinstance(typed, list)
             else (),
@@ -78,6 +83,12 @@ class Circumstances:
         """Of experiment 2 in the full protocol."""
         said = self.protocol.get("repeats")
         return said if isinstance(said, int) and said >= 1 else thesis.REPEATS
+
+    @property
+    def processes(self) -> int | None:
+        """Runs at a time of the last sitting, where its engine says so."""
+        found = re.match(r"(\d+) process", self.engines[-1]) if self.engines else None
+        return int(found[1]) if found and int(found[1]) else None
 
     @property
     def departures(self) -> tuple[str, ...]:
@@ -96,6 +107,10 @@ class Circumstances:
         )
 
 
+def _last_of_each(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(reversed(dict.fromkeys(reversed(list(names)))))
+
+
 def _json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -109,11 +124,6 @@ def _mapping(value: Any) -> dict[str, Any]:
 
 def _rows(value: Any) -> list[dict[str, Any]]:
     return [one for one in value if isinstance(one, dict)] if isinstance(value, list) else []
-
-
-def expected_runs(repeats: int, models: int, thesis_models: int) -> int:
-    """Runs of the full protocol: experiment 1 and the repeats of experiment 2."""
-    return len(thesis.FRACTIONS) * (thesis_models + models * repeats)
 
 
 def wall_hours(record: Record) -> float | None:
@@ -173,8 +183,59 @@ def broken_pairs(record: Record) -> tuple[str, ...]:
     return tuple(said)
 
 
+@dataclass(frozen=True)
+class TimeLeft:
+    """What the runs that are missing would take, judged by those that are there.
+
+    Attributes:
+        runs: how many are missing.
+        run_s: s, the sum of their run times: epochs times what an epoch of the model took so far.
+        at_a_time: processes of the last sitting, or runs that went at a time so far, on average
+            over the time in which any did.
+        guessed: models without a finished run; an epoch of theirs is taken to cost as much as the
+            mean of all others.
+    """
+
+    runs: int
+    run_s: float
+    at_a_time: float | None
+    guessed: tuple[str, ...] = ()
+
+
+def time_left(record: Record, circumstances: Circumstances) -> TimeLeft | None:
+    """Estimates the time of the runs that a record lacks; None where it lacks none.
+
+    Args:
+        record: finished runs.
+        circumstances: know the protocol, or it is the thesis', and what ran it.
+    """
+    known = {f.name for f in fields(Protocol)}
+    try:
+        whole = Protocol(**{name: v for name, v in circumstances.protocol.items() if name in known})
+    except (OffbeatError, TypeError, ValueError):  # of another version, or damaged
+        return None
+    there = set(record.runs["run_id"].tolist())
+    missing = [run for run in whole.runs() if run.run_id not in there]
+    if not missing:
+        return None
+    seconds, epochs = (record.runs[name].astype(float) for name in ("seconds", "epochs"))
+    usual = float(seconds.sum() / epochs.sum())
+    each = {
+        str(model): float(seconds[mine].sum() / epochs[mine].sum())
+        for model in set(record.runs["model"].tolist())
+        if (mine := record.runs["model"] == model).any()
+    }
+    covered = wall_hours(record)
+    return TimeLeft(
+        len(missing),
+        sum(each.get(run.model, usual) * run.epochs for run in missing),
+        circumstances.processes or (float(seconds.sum() / (3600 * covered)) if covered else None),
+        tuple(dict.fromkeys(run.model for run in missing if run.model not in each)),
+    )
+
+
 def time_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
-    """Time and its split, as names and values."""
+    """Time and its split, as names and values; for a part of the protocol, what is left."""
     seconds = record.runs["seconds"].astype(float)
     facts = [("Runs", f"{len(record)}"), ("Sum of the run times", hours(seconds.sum()))]
     for experiment in (1, 2):
@@ -187,12 +248,37 @@ def time_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, 
     if covered is not None:
         facts.append(("Wall time with at least one run going", hours(3600 * covered)))
     if circumstances.sittings_s is not None:
-        facts.append(("Wall time of all sittings", hours(circumstances.sittings_s)))
+        count = circumstances.sittings
+        said = f"{hours(circumstances.sittings_s)}, {count} sitting{'s' * (count != 1)}"
+        facts.append(("Wall time of all sittings", said))
+    if covered:
+        facts.append(("Runs at a time, on average", f"{seconds.sum() / (3600 * covered):.1f}"))
     if circumstances.engines:
         facts.append(("Ran by", "; ".join(circumstances.engines)))
     ended = sorted(str(t) for t in record.runs["finished_at"])
     facts += [("First run finished", ended[0]), ("Last run finished", ended[-1])]
+    left = time_left(record, circumstances)
+    if left is not None:
+        facts += _left_facts(left, float(seconds.sum()))
     return facts
+
+
+def _left_facts(left: TimeLeft, spent: float) -> list[tuple[str, str]]:
+    said = f"{left.runs} runs, about {hours(left.run_s)} of run time"
+    total = f"about {hours(spent + left.run_s)} of run time"
+    if left.at_a_time:
+        pace = f"at {left.at_a_time:.2g} runs at a time"
+        said += f", {hours(left.run_s / left.at_a_time)} of wall time {pace}"
+        total += f", {hours((spent + left.run_s) / left.at_a_time)} of wall time {pace}"
+    basis = "what an epoch of each model has taken so far"
+    if left.guessed:
+        named = ", ".join(map(label, left.guessed))
+        basis += f"; no run yet of {named}, which are taken to cost as much as the others"
+    return [
+        ("Still to run (estimate)", said),
+        ("The whole protocol (estimate)", total),
+        ("Basis of the estimate", basis),
+    ]
 
 
 def machine_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:

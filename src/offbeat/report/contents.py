@@ -102,13 +102,15 @@ class Contents:
             tables.repeats_table(record, repeats=repeats),
             tables_tests.normality_table(record),
             tables_tests.rule_table(record, self.rules),
-            tables_beyond.all_models_table(record, repeats=repeats, number="A.1"),
+            tables_beyond.distance_table(record, number="A.1"),
+            tables_beyond.all_models_table(record, repeats=repeats, number="A.2"),
             *(
                 tables_tests.paired_table(
                     record, self.families["ode_models", scoring], number=number, scoring=scoring
                 )
-                for number, scoring in (("A.2", "published"), ("A.3", "honest"))
+                for number, scoring in (("A.3", "published"), ("A.4", "honest"))
             ),
+            tables_tests.ranks_table(self.ranks, number="A.5", scoring="honest"),
             *(
                 tables_tests.family_table(
                     record,
@@ -121,11 +123,11 @@ class Contents:
                 )
                 for number, name, caption in _FAMILY_TABLES
             ),
-            tables_beyond.distance_table(record, number="A.9"),
-            stability.spread_table(record, self.spreads, number="A.10"),
-            stability.speed_table(record, number="A.11"),
-            tables_tests.ranks_table(self.ranks, number="A.12", scoring="honest"),
-            tables_beyond.cost_table(record, number="A.13"),
+            stability.spread_table(record, self.spreads, number="A.11"),
+            stability.speed_table(record, number="A.12"),
+            stability.choice_table(record, number="A.13"),
+            tables_beyond.runs_table(record, repeats=repeats, number="A.14"),
+            tables_beyond.cost_table(record, number="A.15"),
         ]
         return {table.number: table for table in made}
 
@@ -134,30 +136,30 @@ class Contents:
     @cached_property
     def _drawn(self) -> tuple[Mapping[str, Picture], tuple[str, ...]]:
         pictures, missing = list[Picture](), list[str]()
+        lacking = list[str]()
         for fraction in thesis.FRACTIONS:
             number = thesis.CURVE_FIGURES[fraction]
             if self._has_curves(fraction):
                 pictures.append(self._curves(number, fraction))
             else:
-                missing.append(
-                    f"Figure {number} needs a curve of experiment 1 at {percent(fraction)}."
-                )
+                lacking.append(number)
+        missing += _needs(lacking, "a run of experiment 1 with its curve")
+        lacking = []
         for fraction in thesis.FRACTIONS:
             number = thesis.BOX_FIGURES[fraction]
             if len(self.record.where(experiment=2, fraction=fraction)):
                 pictures.append(self._boxes(number, fraction))
             else:
-                missing.append(
-                    f"Figure {number} needs runs of experiment 2 at {percent(fraction)}."
-                )
+                lacking.append(number)
+        missing += _needs(lacking, "a run of experiment 2")
         ranked = {f: r for f, r in self.ranks.items() if isinstance(r, FriedmanResult)}
         if ranked:
-            pictures.append(_ranks_picture("A.2", ranked))
+            pictures.append(_ranks_picture("A.1", ranked))
         else:
-            missing.append("Figure A.2 needs three models with three repeats in common.")
+            missing.append("Figure A.1 needs three models with three repeats in common.")
         if self.illustrations is None:
             missing.append(
-                "Figures 3.1, 3.2, 2.5 and A.1 need recordings and trained models: run "
+                "Figures 3.1, 3.2, 2.5 and A.2 need recordings and trained models: run "
                 "'offbeat report' where the checkpoints of the runs and the extra 'sim' are."
             )
             return {p.number: p for p in pictures}, tuple(missing)
@@ -188,8 +190,9 @@ class Contents:
         at = percent(fraction)
         return Picture(
             number,
-            f"Learning curves, {at} of the rows observed. Hollow markers: the thesis' table "
-            f"{thesis.CURVE_TABLES[fraction]}.",
+            f"Learning curves of one run per model, {at} of the rows observed; axes are "
+            "logarithmic, and the first epochs may lie above them. Hollow markers: the thesis' "
+            f"table {thesis.CURVE_TABLES[fraction]}.",
             f"Validation MSE by epoch at {at}, two panels: published and honest scoring. At the "
             f"last epoch: {'; '.join(ends)}.",
             curves_figure(self.record, fraction),
@@ -205,9 +208,9 @@ class Contents:
         at = percent(fraction)
         return Picture(
             number,
-            f"Test MSE of the repeats, {at} of the rows observed; note the logarithmic axis of the "
-            "lower panel. Boxes: quartiles and median; whiskers: to the farthest run within 1.5 "
-            "times the box; dots: runs.",
+            f"Test MSE of the repeats, {at} of the rows observed; the axis of the "
+            "lower panel is logarithmic. Boxes: quartiles and median; whiskers: to the farthest "
+            "run within 1.5 times the box; dots: runs.",
             f"Box plots of the test MSE at {at}, published and honest scoring. Medians under "
             f"honest scoring: {', '.join(medians)}.",
             boxes_figure(self.record, fraction),
@@ -218,11 +221,27 @@ class Contents:
     @property
     def missing(self) -> tuple[str, ...]:
         """What is not there, and why, a sentence each."""
+        there, asked = self.progress
+        if there == asked:
+            return self._drawn[1]
+        first, second = (len(self.record.where(experiment=e)) for e in (1, 2))
         runs = (
-            tables.missing_runs(self.record, 1, thesis.MODELS, 1),
-            tables.missing_runs(self.record, 2, MODELS, self.repeats),
+            f"{there} of {asked} runs are there: {first} of {len(thesis.MODELS) * _SHARES} of "
+            f"experiment 1 and {second} of {len(MODELS) * _SHARES * self.repeats} of experiment 2 "
+            "(table A.14). What needs the others is left open, and says so where it stands."
         )
-        return (*filter(None, runs), *self._drawn[1])
+        return (runs, *self._drawn[1])
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Runs of the full protocol that are there, and how many it has."""
+        there = sum(
+            len(self.record.where(experiment=e, model=m, fraction=f))
+            for e, models in ((1, thesis.MODELS), (2, MODELS))
+            for m in models
+            for f in thesis.FRACTIONS
+        )
+        return there, _SHARES * (len(thesis.MODELS) + len(MODELS) * self.repeats)
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -234,13 +253,27 @@ class Contents:
         )
 
 
+_SHARES = len(thesis.FRACTIONS)
+
 _FAMILY_TABLES = (
-    ("A.4", "against_plain", "ODE models against GRU and GRU-D of the thesis' rows, paired."),
-    ("A.5", "against_fair", "ODE models against GRU and GRU-D without self-feeding, paired."),
-    ("A.6", "self_feeding", "What self-feeding does to GRU and GRU-D, paired."),
-    ("A.7", "anchored", "The anchored model against the others, paired."),
-    ("A.8", "last_value", "Every model against the last observed value, paired."),
+    ("A.6", "against_plain", "ODE models against GRU and GRU-D of the thesis' rows, paired."),
+    ("A.7", "against_fair", "ODE models against GRU and GRU-D without self-feeding, paired."),
+    (
+        "A.8",
+        "self_feeding",
+        "GRU and GRU-D without self-feeding against those of the thesis' rows, paired.",
+    ),
+    ("A.9", "anchored", "The anchored model against the others, paired."),
+    ("A.10", "last_value", "Every model against the last observed value, paired."),
 )
+
+
+def _needs(numbers: Sequence[str], what: str) -> list[str]:
+    if not numbers:
+        return []
+    named = ", ".join(numbers)
+    verb = "Figure {} needs {} at its" if len(numbers) == 1 else "Figures {} each need {} at their"
+    return [f"{verb.format(named, what)} share of observed rows."]
 
 
 def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
@@ -264,9 +297,9 @@ def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
         pictures.append(
             Picture(
                 "3.2",
-                f"Two channels of the first {count} trajectories of the data: {CHANNELS[0]}, the "
-                "vertical position of the torso from where the model file has it, and "
-                f"{CHANNELS[1]}, the angle of the knee.",
+                f"Two of the {len(shown.names)} channels of the first {count} trajectories of the "
+                "data: the height of the torso (rootz_qpos, from where the model file has it) "
+                "and the angle of the knee (knee_qpos).",
                 f"{count} lines over {duration:.0f} ms in two panels: height of the torso and "
                 "angle of the knee.",
                 channels_figure(shown),
@@ -281,7 +314,7 @@ def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
                 "2.5",
                 f"Hidden states along a trajectory that no model was trained on, {at} of the rows "
                 "observed. Vertical lines: observed rows. Shown are the five units of each model "
-                "that move most.",
+                f"that move most. {_trained(shown)}",
                 f"Hidden units over time, one panel per model: {names}.",
                 states_figure(shown.trace),
                 wide=True,
@@ -289,18 +322,28 @@ def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
         )
     if shown.map is not None:
         names = ", ".join(map(label, shown.map.places))
+        colour = CHANNELS.get(shown.map.name, shown.map.name).lower()
         pictures.append(
             Picture(
-                "A.1",
+                "A.2",
                 "Hidden states on trajectories that no model was trained on, laid out by UMAP for "
-                f"each model on its own; {at} of the rows observed. Colour: {shown.map.name}. "
-                "Distances between far groups mean nothing.",
+                f"each model on its own; {at} of the rows observed. Colour: {colour}. "
+                f"Distances between far groups mean nothing. {_trained(shown)}",
                 f"One scatter plot per model: {names}.",
                 map_figure(shown.map),
                 wide=True,
             )
         )
     return pictures, tuple(missing)
+
+
+def _trained(shown: Illustrations) -> str:
+    """Which runs the models of the figures are, in a sentence."""
+    by = dict[str, list[str]]()
+    for model, run in shown.runs.items():
+        by.setdefault(run[1:2], []).append(label(model))
+    said = "; ".join(f"{', '.join(models)} of experiment {one}" for one, models in by.items())
+    return f"Models of the first repeat: {said}." if said else ""
 
 
 def _ranks_picture(number: str, results: Mapping[float, FriedmanResult]) -> Picture:
@@ -313,8 +356,8 @@ def _ranks_picture(number: str, results: Mapping[float, FriedmanResult]) -> Pict
         )
     return Picture(
         number,
-        "Average ranks of the models over the repeats, honest scoring. A bar joins models that "
-        "Nemenyi's test does not tell apart.",
+        "Average ranks of the models over the repeats, honest scoring. A grey bar joins models "
+        "that Nemenyi's test does not tell apart; CD is its critical difference.",
         f"Average ranks of the models. {' '.join(said)}",
         ranks_figure({percent(f): result for f, result in results.items()}),
         wide=True,

@@ -56,8 +56,8 @@ def boxes_figure(record: Record, fraction: float) -> Figure:
             axes.set_title(title, loc="left")
             if scoring == "honest":  # the models differ by more than a factor here
                 axes.set_xscale("log")
-                plain_ticks(axes.xaxis, axes.get_xlim())
-            axes.set_xlabel("Test MSE (scaled units)")
+                plain_ticks(axes.xaxis, axes.get_xlim(), times=1e3)
+            axes.set_xlabel("Test MSE (scaled units, 10$^{-3}$)")
         _thesis_intervals(both[0], fraction, thesis.MODELS)
     return figure
 
@@ -94,7 +94,7 @@ def _boxes(axes: Axes, samples: dict[str, NDArray[np.float64]]) -> None:
     axes.grid(False, axis="y")
     axes.tick_params(axis="y", length=0)
     axes.locator_params(axis="x", nbins=4)
-    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{1e3 * value:g}")
 
 
 def _thesis_intervals(axes: Axes, fraction: float, names: Sequence[str]) -> None:

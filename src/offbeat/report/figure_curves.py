@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from offbeat.errors import InputError
 from offbeat.report import thesis_numbers as thesis
@@ -15,13 +19,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_CHOSEN = "#595959"
+_CUT = 10
+"""Epochs that may lie above a panel, of curves ten times as long."""
 _PANELS = {"published": "Published scoring", "honest": "Honest scoring"}
 
 
 def curves_figure(record: Record, fraction: float) -> Figure:
     """Validation MSE by epoch, all models of the thesis, published and honest scoring.
 
-    Hollow markers are the thesis' tables 3.1 to 3.4; a dashed line is the last-value predictor.
+    Hollow markers are the thesis' tables 3.1 to 3.4; a dashed line is the last-value
+    predictor, a vertical one the number of epochs that the thesis chose.
 
     Args:
         record: its runs of experiment 1, with their curves.
@@ -45,7 +53,7 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             "need one"
         )
     with rc_context(RC):
-        figure = Figure(figsize=(COLUMN_WIDTH, 4.6), layout="constrained")
+        figure = Figure(figsize=(COLUMN_WIDTH, 5.2), layout="constrained")
         panels = figure.subplots(2, sharex=True)
         for axes, (scoring, title) in zip(panels, _PANELS.items(), strict=True):
             for model, curve in curves.items():
@@ -60,8 +68,10 @@ def curves_figure(record: Record, fraction: float) -> Figure:
                 )
             axes.set_yscale("log")
             axes.set_title(title, loc="left")
-            plain_ticks(axes.yaxis, axes.get_ylim())
         _thesis_points(panels[0], fraction)
+        chosen = thesis.CHOSEN_EPOCHS[fraction]
+        for axes in panels:
+            axes.axvline(chosen, color=_CHOSEN, linewidth=0.8, label=f"Thesis' choice, {chosen}")
         rows = record.where(experiment=1, fraction=fraction)
         last, style = record.values("last_value_honest_mse", rows)[0], style_of("last_value")
         panels[1].axhline(
@@ -70,6 +80,9 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             linestyle=style.dash,
             label=f"{style.label} (test part)",
         )
+        for axes, scoring in zip(panels, _PANELS, strict=True):
+            axes.set_ylim(top=_top(curves.values(), f"validation_{scoring}_mse"))
+            plain_ticks(axes.yaxis, axes.get_ylim())
         figure.supylabel("Validation MSE (scaled units)", fontsize=RC["axes.labelsize"])
         panels[-1].set_xlabel("Epoch")
         panels[-1].set_xlim(left=0)
@@ -83,6 +96,14 @@ def curves_figure(record: Record, fraction: float) -> Figure:
             ncols=2,
         )
     return figure
+
+
+def _top(curves: Iterable[Mapping[str, NDArray[np.float64]]], column: str) -> float | None:
+    """Where a panel ends: what is above in the first epochs would press all else together."""
+    found = [curve[column] for curve in curves]
+    if min(map(len, found)) < 10 * _CUT:
+        return None
+    return 1.1 * max(float(values[_CUT - 1]) for values in found)
 
 
 def _thesis_points(axes: Axes, fraction: float) -> None:
@@ -107,6 +128,6 @@ def _thesis_points(axes: Axes, fraction: float) -> None:
         marker="o",
         markersize=4,
         markerfacecolor="none",
-        markeredgecolor="#595959",
-        label="Thesis, in its model's colour",
+        markeredgecolor=_CHOSEN,
+        label="Thesis, by colour",
     )

@@ -15,8 +15,8 @@ from offbeat.report.style import PAGE_WIDTH, RC
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CHANNELS = ("rootz_qpos", "knee_qpos")
-"""Channels of figure 3.2: height of the torso and angle of the knee."""
+CHANNELS = {"rootz_qpos": "Height of the torso", "knee_qpos": "Angle of the knee"}
+"""Channels of figure 3.2, and what they are."""
 
 
 def frames_figure(illustrations: Illustrations, *, trajectory: int = 0, frames: int = 8) -> Figure:
@@ -49,7 +49,9 @@ def frames_figure(illustrations: Illustrations, *, trajectory: int = 0, frames: 
     return figure
 
 
-def channels_figure(illustrations: Illustrations, channels: Sequence[str] = CHANNELS) -> Figure:
+def channels_figure(
+    illustrations: Illustrations, channels: Sequence[str] = tuple(CHANNELS)
+) -> Figure:
     """Two channels over time, a line per recording.
 
     Args:
@@ -73,7 +75,8 @@ def channels_figure(illustrations: Illustrations, channels: Sequence[str] = CHAN
             for values, shade in zip(recordings, shades, strict=True):
                 axes.plot(illustrations.times, values, color=shade, linewidth=1.0)
             unit = illustrations.units[channel]
-            axes.set_ylabel(f"{name} ({unit})" if unit else name)
+            shown = CHANNELS.get(name, name)
+            axes.set_ylabel(f"{shown} ({unit})" if unit else shown)
             axes.set_xlabel("Time (s)")
             axes.margins(x=0.01)
     return figure

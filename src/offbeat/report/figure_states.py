@@ -8,6 +8,7 @@ import numpy as np
 
 from offbeat.errors import InputError
 from offbeat.experiment.illustrations import StateMap, Trace
+from offbeat.report.figure_robot import CHANNELS
 from offbeat.report.style import INK, PAGE_WIDTH, RC, style_of
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def states_figure(trace: Trace) -> Figure:
             moved = np.argsort(-np.ptp(after, axis=0), kind="stable")[:_UNITS_SHOWN]
             for seen in trace.times[trace.observed]:
                 axes.axvline(seen, color=_SEEN, linewidth=0.6, zorder=0)
-            for shade, unit in zip(np.linspace(1.0, 0.4, len(moved)), moved, strict=True):
+            for shade, unit in zip(np.linspace(1.0, 0.5, len(moved)), moved, strict=True):
                 axes.plot(
                     times, path[:, unit], color=style_of(model).colour, alpha=shade, linewidth=1.0
                 )
@@ -106,6 +107,6 @@ def map_figure(state_map: StateMap) -> Figure:
         unit = f" ({state_map.unit})" if state_map.unit else ""
         if drawn is not None:
             bar = figure.colorbar(drawn, ax=panels.tolist(), shrink=0.7, aspect=30, pad=0.02)
-            bar.set_label(f"{state_map.name}{unit}", color=INK)
+            bar.set_label(f"{CHANNELS.get(state_map.name, state_map.name)}{unit}", color=INK)
             bar.outline.set_visible(False)
     return figure

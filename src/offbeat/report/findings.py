@@ -26,10 +26,12 @@ class Verdict:
     Attributes:
         word: `HOLDS`, `PARTLY`, `FAILS`, `UNDECIDED`, `NOT_CONTRADICTED` or `MISSING`.
         evidence: sentences, each with its numbers.
+        count: how many parts of the claim hold; empty where it has but one.
     """
 
     word: str
     evidence: tuple[str, ...]
+    count: str = ""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ def sentence(pair: Pair) -> str:
     """A paired comparison in words, with difference, interval and p."""
     a, b, at = label(pair.a), label(pair.b), percent(pair.fraction)
     scoring = SCORING_NAMES[pair.scoring]
+    if pair.tied:
+        return f"At {at}, {a} and {b} are not told apart under {scoring}: {pair.missing}."
     if pair.result is None or pair.t_holm is None:
         return f"At {at}, {a} and {b} cannot be compared under {scoring}: {pair.missing}."
     result, rmse = pair.result, pair.measure == "RMSE"
@@ -94,7 +98,7 @@ def p_text(p: float | None) -> str:
 
 def all_better(pairs: Sequence[Pair]) -> Verdict:
     """The first model of every pair is better: how many of the tests say so."""
-    tested = [p for p in pairs if p.result is not None]
+    tested = [p for p in pairs if p.result is not None or p.tied]
     better = sum(p.better for p in tested)
     worse = sum(p.worse for p in tested)
     count = (
@@ -102,7 +106,31 @@ def all_better(pairs: Sequence[Pair]) -> Verdict:
         f"worse, {len(tested) - better - worse} do not tell the two apart"
         + (f", {len(pairs) - len(tested)} cannot be made yet." if len(tested) < len(pairs) else ".")
     )
-    return Verdict(word(len(pairs), len(tested), better, worse), (count, *map(sentence, pairs)))
+    return judged(len(pairs), len(tested), better, worse, (count, *map(sentence, pairs)))
+
+
+def judged(
+    asked: int, tested: int, right: int, wrong: int, evidence: Sequence[str], parts: str = "parts"
+) -> Verdict:
+    """The verdict on a claim of several parts.
+
+    Args:
+        asked: how many parts it has.
+        tested: how many of them the record lets us test.
+        right: how many tests bear it out.
+        wrong: how many contradict it.
+        evidence: sentences.
+        parts: what they are called.
+    """
+    if tested < asked:
+        count = f"{tested} of {asked} {parts} can be tested yet"
+    else:
+        undecided = asked - right - wrong
+        said = [f"{right} of {asked} {parts}"]
+        said += [f"{wrong} against"] if wrong else []
+        said += [f"{undecided} not decided"] if undecided else []
+        count = ", ".join(said)
+    return Verdict(word(asked, tested, right, wrong), tuple(evidence), count if asked > 1 else "")
 
 
 def word(asked: int, tested: int, right: int, wrong: int) -> str:
@@ -127,15 +155,32 @@ def directions(pairs: Sequence[Pair], expected: Mapping[float, int]) -> Verdict:
     tested = [p for p in chosen if p.result is not None]
     right = sum(p.better if expected[p.fraction] < 0 else p.worse for p in tested)
     wrong = sum(p.worse if expected[p.fraction] < 0 else p.better for p in tested)
-    return Verdict(word(len(chosen), len(tested), right, wrong), tuple(map(sentence, chosen)))
+    return judged(len(chosen), len(tested), right, wrong, tuple(map(sentence, chosen)))
 
 
 def significance(pairs: Sequence[Pair], better_at: Sequence[float]) -> Verdict:
     """The first model is significantly better at exactly these shares, by the paired tests."""
     tested = [p for p in pairs if p.result is not None]
-    right = sum(p.better if p.fraction in better_at else not p.significant for p in tested)
-    wrong = len(tested) - right
-    return Verdict(word(len(pairs), len(tested), right, wrong), tuple(map(sentence, pairs)))
+    outcomes = [(p.fraction in better_at, p.better, p.worse) for p in tested]
+    right, wrong = _exactly(outcomes)
+    return judged(len(pairs), len(tested), right, wrong, tuple(map(sentence, pairs)))
+
+
+def _exactly(outcomes: Sequence[tuple[bool, bool, bool]]) -> tuple[int, int]:
+    """Parts borne out and contradicted of a claim that a difference is there or is not.
+
+    A test that finds nothing contradicts no claim of a difference: it may be too weak. Nor does it
+    bear out that there is none, unless the same tests find a difference elsewhere.
+
+    Args:
+        outcomes: per part, whether a difference is claimed, the first model is better, is worse.
+    """
+    right = wrong = silent = 0
+    for claimed, better, worse in outcomes:
+        right += claimed and better
+        wrong += worse or (better and not claimed)
+        silent += not claimed and not better and not worse
+    return right + silent * bool(right or wrong), wrong
 
 
 def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verdict:
@@ -145,17 +190,17 @@ def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verd
         rules: of `pairing.thesis_rule`, ODE-RNN first.
         better_at: observed shares at which ODE-GRU-D is to be significantly better.
     """
-    said, right, tested = [], 0, 0
+    said, outcomes = [], []
     names = {"two_sample_t": "the two-sample t test", "welch_t": "Welch's t test"}
     for rule in rules:
         at = percent(rule.fraction)
         if rule.result is None:
             said.append(f"At {at} the rule cannot be applied: {rule.missing}.")
             continue
-        tested += 1
         result = rule.result
         better = result.significant and result.t > 0  # ODE-RNN's mean is the higher
-        right += better if rule.fraction in better_at else not result.significant
+        worse = result.significant and not better
+        outcomes.append((rule.fraction in better_at, better, worse))
         outcome = (
             "does not tell the means apart"
             if not result.significant
@@ -167,7 +212,7 @@ def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verd
             f"{names.get(result.test, result.test)}, which {outcome} ({p_text(result.p)})."
             f"{normal}"
         )
-    return Verdict(word(len(rules), tested, right, tested - right), tuple(said))
+    return judged(len(rules), len(outcomes), *_exactly(outcomes), said)
 
 
 def no_difference(pairs: Sequence[Pair]) -> Verdict:

@@ -33,7 +33,7 @@ _STYLE = """
 html{-webkit-text-size-adjust:100%}
 body{margin:0;background:var(--paper);color:var(--ink);
 font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,"Noto Sans",sans-serif}
-main,header,nav,footer{max-width:62rem;margin:0 auto;padding:0 1.1rem}
+main,header,nav,footer{max-width:67rem;margin:0 auto;padding:0 1.1rem}
 header{padding-top:2rem}
 h1{font-size:1.7rem;line-height:1.25;margin:0 0 .4rem}
 h2{font-size:1.3rem;margin:3rem 0 .6rem;padding-top:.6rem;border-top:1px solid var(--line)}
@@ -54,7 +54,7 @@ caption b{font-weight:600}
 caption span{display:block;position:sticky;left:0;max-width:min(46rem,calc(100vw - 2.2rem))}
 thead th{border-top:2px solid var(--ink);border-bottom:1px solid var(--ink)}
 tbody:last-child tr:last-child>*{border-bottom:2px solid var(--ink)}
-th,td{padding:.22rem .7rem;text-align:right;white-space:nowrap;font-weight:400}
+th,td{padding:.22rem .6rem;text-align:right;white-space:nowrap;font-weight:400}
 thead th{font-weight:600;vertical-align:bottom}
 th:first-child{text-align:left;padding-left:0}
 tr.block th{padding-top:.7rem;font-style:italic;color:var(--soft)}
@@ -93,7 +93,7 @@ dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.4rem}}
 
 _CLASSES = {
     HOLDS: "yes",
-    NOT_CONTRADICTED: "yes",
+    NOT_CONTRADICTED: "open",
     PARTLY: "part",
     FAILS: "no",
     UNDECIDED: "open",
@@ -176,6 +176,8 @@ def finding(one: Finding) -> str:
     lines = []
     for decided_by, verdict in one.verdicts.items():
         word = f'<span class="verdict {_CLASSES[verdict.word]}">{text(verdict.word)}</span>'
+        if verdict.count:
+            word += f" ({text(verdict.count)})"
         evidence = "".join(f"<li>{text(s)}</li>" for s in verdict.evidence)
         lines.append(
             f"<details><summary>{text(decided_by)}: {word}</summary><ul>{evidence}</ul></details>"

@@ -20,6 +20,7 @@ from offbeat.report.statistics import (
     paired_comparison,
     thesis_test,
 )
+from offbeat.report.statistics.samples import FEWEST
 from offbeat.report.table import MINUS
 from offbeat.report.tables import LAST_VALUE, label
 
@@ -59,6 +60,7 @@ class Pair:
         wilcoxon_holm: p of Wilcoxon's test, corrected for the family.
         missing: why there is no result.
         measure: `RMSE` or `epochs`; lower is better.
+        tied: both are equal in every repeat, so that there is no test and no difference.
     """
 
     a: str
@@ -70,6 +72,7 @@ class Pair:
     wilcoxon_holm: float | None = None
     missing: str = ""
     measure: str = "RMSE"
+    tied: bool = False
 
     @property
     def better(self) -> bool:
@@ -123,11 +126,21 @@ def corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
 
 def _pair(record: Record, a: str, b: str, fraction: float, scoring: str) -> Pair:
     first, second = paired_rmse(record, a, b, fraction, scoring)
-    pair = Pair(a, b, fraction, scoring)
+    pair = Pair(a, b, fraction, scoring, missing=too_few(len(first)))
+    if pair.missing:
+        return pair
     try:
         return replace(pair, result=paired_comparison(first, second, names=(label(a), label(b))))
     except InputError as error:
         return replace(pair, missing=str(error))
+
+
+def too_few(repeats: int) -> str:
+    """Why repeats that both models have are too few for a test; empty where they are not."""
+    if repeats >= FEWEST:
+        return ""
+    there = "1 repeat has both" if repeats == 1 else f"{repeats or 'no'} repeats have both"
+    return f"{there}, a test needs at least {FEWEST}"
 
 
 def paired_rmse(
@@ -169,6 +182,9 @@ def thesis_rule(
     rules = []
     for fraction in thesis.FRACTIONS:
         first, second = paired_rmse(record, a, b, fraction, scoring)
+        if few := too_few(len(first)):
+            rules.append(Rule(fraction, scoring, None, few))
+            continue
         try:
             result = thesis_test(first, second, alpha=thesis.ALPHA, names=(label(a), label(b)))
             rules.append(Rule(fraction, scoring, result))

@@ -89,6 +89,13 @@ class Record:
             kept = ~np.isin(self.curves["run_id"], sorted(strange))
             object.__setattr__(self, "curves", {k: v[kept] for k, v in self.curves.items()})
 
+    @property
+    def folder(self) -> str:
+        """The folder it was read from as a command can name it; empty where that is elsewhere."""
+        path = Path(self.source)
+        inside = len(path.parts) > 1 and not path.is_absolute() and ".." not in path.parts
+        return path.as_posix() if inside else ""
+
     # --- what is asked of it ----------------------------------------------------------------------
 
     def where(

@@ -16,9 +16,11 @@ from offbeat.report.contents import Contents
 from offbeat.report.document import document
 from offbeat.report.page import Picture
 from offbeat.report.records import Record, read_record
+from offbeat.report.summary import summary as summarised
 from offbeat.report.table import Table
 
 PAGE = "report.html"
+SUMMARY = "summary.md"
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,14 @@ class ReportFiles:
 
     Attributes:
         page: the HTML page, with everything in it.
+        summary: the answers as a Markdown document.
         tables: CSV, Markdown and LaTeX of each table.
         figures: PNG and PDF of each figure.
         messages: what is not there, and why.
     """
 
     page: Path
+    summary: Path
     tables: tuple[Path, ...]
     figures: tuple[Path, ...]
     messages: tuple[str, ...]
@@ -41,6 +45,7 @@ class ReportFiles:
         """JSON-like form."""
         return {
             "page": str(self.page),
+            "summary": str(self.summary),
             "tables": [str(path) for path in self.tables],
             "figures": [str(path) for path in self.figures],
             "messages": list(self.messages),
@@ -50,7 +55,8 @@ class ReportFiles:
         lines = [
             f"{self.page}: {len(self.tables) // 3} tables, {len(self.figures) // 2} figures; each "
             f"also as a file of its own in {self.page.parent / 'tables'} and "
-            f"{self.page.parent / 'figures'}"
+            f"{self.page.parent / 'figures'}",
+            f"{self.summary}: the answers in short",
         ]
         return "\n".join([*lines, *self.messages])
 
@@ -61,6 +67,7 @@ def write_report(
     *,
     illustrations: Illustrations | None = None,
     repeats: int | None = None,
+    summary: str | Path | None = None,
 ) -> ReportFiles:
     """Writes the thesis' tables, figures and tests beside ours, as one page and as files.
 
@@ -69,10 +76,11 @@ def write_report(
 
     Args:
         runs: folder of a reproduction, or of its record; or a record that was read.
-        out: folder for `report.html`, `tables/` and `figures/`.
+        out: folder for `report.html`, `summary.md`, `tables/` and `figures/`.
         illustrations: recordings and hidden states; by default `illustrations.npz` in `runs`.
         repeats: of experiment 2 in the full protocol; by default what `protocol.json` in `runs`
             says, or the thesis' 10.
+        summary: where to write the Markdown document in place of `summary.md` in `out`.
 
     Returns:
         The files, and what is not there.
@@ -85,6 +93,7 @@ def write_report(
         >>> print(write_report("runs/thesis", "runs/report"))  # doctest: +SKIP
     """
     out = writable(out, folder=True)
+    answers = out / SUMMARY if summary is None else writable(summary)
     if repeats is not None and repeats < 1:
         raise InputError(f"repeats must be at least 1, got {repeats}")
     circumstances = Circumstances()
@@ -104,8 +113,9 @@ def write_report(
     for picture in contents.pictures.values():
         pictures += _write_picture(picture, out / "figures")
     write_text(out / PAGE, document(contents))
+    write_text(answers, summarised(contents))
     return ReportFiles(
-        out / PAGE, tuple(tables), tuple(pictures), (*contents.faults, *contents.missing)
+        out / PAGE, answers, tuple(tables), tuple(pictures), (*contents.faults, *contents.missing)
     )
 
 

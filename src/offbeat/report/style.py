@@ -43,12 +43,12 @@ STYLES: dict[str, Style] = {
     "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),
     "ode_gru_d": Style("ODE-GRU-D", "#0072B2", "D", (0, (6, 1.2, 1, 1.2, 1, 1.2))),
     "anchored_ode_gru_d": Style("Anchored ODE-GRU-D", "#D55E00", "o"),
-    "rnn_decay": Style("RNN-Decay", "#CC79A7", "v", _DASH_DOT),
-    "rnn": Style("RNN", "#999933", "P", _DOTTED),
+    "rnn_decay": Style("RNN-Decay", "#AA4499", "v", _DASH_DOT),
+    "rnn": Style("RNN", "#DDCC77", "P", _DOTTED),
     "lstm": Style("LSTM", "#332288", "X", _DOTTED),
     "neural_ode": Style("Neural ODE", "#882255", "*", _DASHED),
-    "gru_fair": Style("Fair GRU", "#AA4499", "o", _DOTTED),
-    "gru_d_fair": Style("Fair GRU-D", "#DDCC77", "s", _DASH_DOT),
+    "gru_fair": Style("Fair GRU", "#CC79A7", "o", _DOTTED),
+    "gru_d_fair": Style("Fair GRU-D", "#999933", "s", _DASH_DOT),
 }
 """The styles by id of the model; `truth` and `last_value` stand beside them."""
 
@@ -101,17 +101,20 @@ RC: dict[Any, Any] = {
 """Settings of matplotlib, in force only while a figure is made or saved."""
 
 
-def plain_ticks(axis: Any, limits: tuple[float, float]) -> None:
+def plain_ticks(axis: Any, limits: tuple[float, float], *, times: float = 1.0) -> None:
     """A few labels on a logarithmic axis, in plain numbers, also within one decade.
 
     Args:
         axis: of matplotlib.
         limits: between which it is seen.
+        times: labels are the values times this; the name of the axis has to say so.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     decades = math.log10(limits[1] / limits[0])
     steps = (1.0,) if decades > 2.5 else (1.0, 2.0, 5.0) if decades > 0.7 else (1, 1.5, 2, 3, 5, 7)
     axis.set_major_locator(LogLocator(subs=steps))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.7f}".rstrip("0")))
+    axis.set_major_formatter(
+        FuncFormatter(lambda value, _: f"{times * value:.7f}".rstrip("0").rstrip("."))
+    )
     axis.set_minor_formatter(NullFormatter())

@@ -125,6 +125,7 @@ class Table:
             r"  \centering",
             rf"  \caption{{{_latex(self.caption)}}}",
             rf"  \label{{tab:{self.slug.removeprefix('table-')}}}",
+            r"  \small",
             rf"  \begin{{tabular}}{{l{'r' * len(self.columns)}}}",
             r"    \toprule",
             "    " + " & ".join(_latex(c) for c in (self.corner, *self.columns)) + r" \\",
@@ -171,17 +172,20 @@ class Table:
 def bold_lowest(
     rows: Sequence[tuple[str, Sequence[Cell]]],
 ) -> tuple[tuple[str, tuple[Cell, ...]], ...]:
-    """Sets the lowest number of each column in bold; all that print alike, where several do."""
+    """Sets the lowest number of each column in bold; all that print alike, where several do.
+
+    A column in which a number is missing has no best one.
+    """
     marked = [list(cells) for _, cells in rows]
     for column in range(len(marked[0]) if marked else 0):
-        values = [cells[column] for cells in marked if cells[column].value is not None]
-        if not values:
+        values = [cells[column] for cells in marked]
+        if any(cell.value is None for cell in values):
             continue
         lowest = min(values, key=lambda cell: float(cell.value or 0.0))
         shown = _mean(lowest.text)
         for cells in marked:
             cell = cells[column]
-            if cell.value is not None and _mean(cell.text) == shown:
+            if _mean(cell.text) == shown:
                 cells[column] = replace(cell, bold=True)
     return tuple((label, tuple(cells)) for (label, _), cells in zip(rows, marked, strict=True))
 

@@ -27,10 +27,11 @@ _MIXED_NOTE = (
     f"{MIXED} The runs behind the number were not made alike (code, processor, kernel body, torch "
     "or data); machine and versions are listed below."
 )
-_BOLD_NOTE = "Bold: the lowest of its column within a block."
+_BOLD_NOTE = "Bold: the lowest of its column within a block, where all are there."
 
 _MSE_DIGITS = {"published": 5, "honest": 6}
-_RMSE_DIGITS = 4
+_RMSE_DIGITS = {"published": 4, "honest": 5, "honest_hidden": 5}
+"""As the thesis prints them, and one more where errors are smaller."""
 
 
 def percent(fraction: float) -> str:
@@ -100,7 +101,6 @@ def curve_table(record: Record, fraction: float) -> Table:
             ),
         )
     ]
-    remarks = []
     for scoring in ("published", "honest"):
         digits = _MSE_DIGITS[scoring]
         rows = [(label(m), _epochs(record, m, fraction, scoring)) for m in thesis.MODELS]
@@ -109,15 +109,17 @@ def curve_table(record: Record, fraction: float) -> Table:
         cell = mean_cell(record, last, runs, digits=digits)
         rows.append((f"{label(LAST_VALUE)} (test part)", [cell] * len(thesis.EPOCHS)))
         blocks.append(Block(HEADINGS[scoring], bold_lowest(rows)))
+    ends = dict[str, list[str]]()
     for model in thesis.MODELS:
         runs = record.where(experiment=1, model=model, fraction=fraction)
         if not len(runs):
-            remarks.append(f"{label(model)}: no run of experiment 1 yet.")
+            ends.setdefault("no run of experiment 1 yet", []).append(label(model))
             continue
         curve = record.curve(str(record.values("run_id", runs)[0]))
         last_epoch = int(curve["epoch"][-1]) if len(curve["epoch"]) else 0
         if last_epoch < thesis.EPOCHS[-1]:
-            remarks.append(f"{label(model)}: the record's curve has {last_epoch} epochs.")
+            ends.setdefault(f"the curve has {last_epoch} epochs", []).append(label(model))
+    remarks = [f"{', '.join(models)}: {said}." for said, models in ends.items()]
     return Table(
         number,
         f"Validation MSE while training, {percent(fraction)} of the rows observed.",
@@ -245,7 +247,9 @@ def rmse_rows(
         cells = []
         for fraction in thesis.FRACTIONS:
             runs, values = rmse_of(record, model, fraction, scoring)
-            cells.append(mean_cell(record, values, runs, digits=_RMSE_DIGITS, expected=repeats))
+            cells.append(
+                mean_cell(record, values, runs, digits=_RMSE_DIGITS[scoring], expected=repeats)
+            )
         rows.append((label(model), cells))
     return rows
 
@@ -264,12 +268,13 @@ def rmse_of(
 
 def missing_runs(record: Record, experiment: int, models: Sequence[str], repeats: int) -> str:
     """A sentence on the runs that the record lacks; empty where it lacks none."""
-    lacking = []
+    counted = 0
     for model in models:
         for fraction in thesis.FRACTIONS:
             there = len(record.where(experiment=experiment, model=model, fraction=fraction))
-            if there < repeats:
-                lacking.append(f"{label(model)} at {percent(fraction)}: {there} of {repeats}")
-    if not lacking:
+            counted += min(there, repeats)
+    asked = len(models) * len(thesis.FRACTIONS) * repeats
+    if counted == asked:
         return ""
-    return f"Not all runs of experiment {experiment} are there. " + "; ".join(lacking) + "."
+    how = "a cell says how many it has; a dash: none" if repeats > 1 else "a dash: not there yet"
+    return f"{counted} of {asked} runs of experiment {experiment} are there: {how}."

@@ -24,7 +24,7 @@ _WITHIN = 2.0
 """Standard deviations of the thesis within which a cell of table 3.6 counts as reproduced."""
 
 
-def all_models_table(record: Record, *, repeats: int, number: str = "A.1") -> Table:
+def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
     """Test RMSE of every model of experiment 2 and of the last value, under three scorings."""
     headings = {**HEADINGS, "honest_hidden": "Ours, honest scoring, hidden rows only"}
     blocks = [
@@ -40,8 +40,8 @@ def all_models_table(record: Record, *, repeats: int, number: str = "A.1") -> Ta
         notes(
             record,
             blocks,
-            "Bold: the lowest of its column within a block. Fair: without self-feeding, updated at "
-            "every row, GRU with the age of each channel as input.",
+            "Bold: the lowest of its column within a block, where all are there. Fair: without "
+            "self-feeding, updated at every row, GRU with the age of each channel as input.",
             missing_runs(record, 2, MODELS, repeats),
         ),
     )
@@ -130,12 +130,35 @@ def constant_residual(record: Record) -> float:
     return float(np.max(np.abs(said.astype(float) - published) / published))
 
 
-# --- cost -----------------------------------------------------------------------------------------
+# --- runs and cost --------------------------------------------------------------------------------
+
+
+def runs_table(record: Record, *, repeats: int, number: str) -> Table:
+    """How many runs of the full protocol are there."""
+    blocks = []
+    for experiment, models, asked in ((1, thesis.MODELS, 1), (2, MODELS, repeats)):
+        rows = []
+        for model in models:
+            cells = []
+            for fraction in thesis.FRACTIONS:
+                there = len(record.where(experiment=experiment, model=model, fraction=fraction))
+                whole = there >= asked
+                cells.append(Cell(f"{there} of {asked}", float(there), n=there, bold=not whole))
+            rows.append((label(model), tuple(cells)))
+        blocks.append(Block(f"Experiment {experiment}", tuple(rows)))
+    return Table(
+        number,
+        "Runs that are there, of those of the full protocol.",
+        "Model",
+        _COLUMNS,
+        tuple(blocks),
+        ("Bold: not all of them.",),
+    )
 
 
 def cost_table(record: Record, *, number: str) -> Table:
     """Wall time of the runs, by experiment and model."""
-    blocks = []
+    blocks, spent = [], float(record.runs["seconds"].sum() / 60)
     for experiment, name in ((1, "Experiment 1"), (2, "Experiment 2")):
         rows = []
         for model in MODELS:
@@ -154,15 +177,17 @@ def cost_table(record: Record, *, number: str) -> Table:
             total = float(record.values("seconds", runs).sum() / 60)
             steps = float(record.values("steps", runs).sum())
             cells.append(Cell(f"{total:.1f}", total, n=len(runs)))
+            cells.append(Cell(f"{100 * total / spent:.1f}", 100 * total / spent, n=len(runs)))
             cells.append(Cell(f"{60e3 * total / steps:.1f}", 60e3 * total / steps, n=len(runs)))
             rows.append((label(model), tuple(cells)))
         if rows:
             blocks.append(Block(name, tuple(rows)))
     return Table(
         number,
-        "Run time in minutes, summed over the runs of a cell, and per optimizer step.",
+        "Run time in minutes, summed over the runs of a cell; its share of all, and per step of "
+        "the optimizer.",
         "Model",
-        (*_COLUMNS, "Sum (min)", "Per step (ms)"),
+        (*_COLUMNS, "Sum (min)", "Share (%)", "Per step (ms)"),
         tuple(blocks),
         ("A run's time is its wall time, with as many threads as the record says.",),
     )

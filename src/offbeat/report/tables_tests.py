@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from offbeat.errors import InputError
 from offbeat.report import thesis_numbers as thesis
-from offbeat.report.pairing import Pair, Rule
+from offbeat.report.pairing import FAIR, Pair, Rule
 from offbeat.report.records import Record
 from offbeat.report.statistics import FriedmanResult, shapiro_wilk
 from offbeat.report.table import MINUS, MIXED, Block, Cell, Table
@@ -20,9 +20,13 @@ SCORING_NAMES = {
 
 _COLUMNS = tuple(map(percent, thesis.FRACTIONS))
 _SIGNIFICANT = f"Bold: below the level of significance, {thesis.ALPHA:g}."
+_FAIR = (
+    "The fair models differ from the thesis' rows in more than self-feeding: they also update at "
+    "every row, and GRU is given the age of each channel."
+)
 _CAVEAT = (
     "The rule takes the two samples to be independent. The runs share windows and masks within a "
-    "repeat, so the paired tests of tables A.2 and A.3 decide."
+    "repeat, so the paired tests of tables A.3 and A.4 decide."
 )
 
 
@@ -228,8 +232,11 @@ def family_table(
         notes(
             record,
             blocks,
-            f"{_SIGNIFICANT} p is the paired t test's, corrected by Holm within a block. Negative: "
-            "the first is better.",
+            f"In brackets p of the paired t test, corrected by Holm within a block. Bold: p ≤ "
+            f"{thesis.ALPHA:g}. Negative: the first is better.",
+            _FAIR
+            if all(p.a in FAIR or p.b in FAIR for ps in families.values() for p in ps)
+            else "",
             f"Pairs without a number lack runs ({len(missing)})." if missing else "",
         ),
     )
@@ -239,8 +246,7 @@ def _pair_cell(record: Record, pair: Pair) -> Cell:
     if pair.result is None or pair.t_holm is None:
         return Cell(n=0)
     value = pair.result.difference.value
-    p = p_cell(pair.t_holm).text
-    text = f"{signed(value)} (p {p})" if p.startswith("<") else f"{signed(value)} (p = {p})"
+    text = f"{signed(value)} ({p_cell(pair.t_holm).text})"
     mark = _mixed(record, (pair.a, pair.b), pair.fraction)
     return Cell(text, value, None, pair.result.runs, bold=pair.significant, mark=mark)
 
