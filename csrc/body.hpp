@@ -532,7 +532,7 @@ struct Scan {
     f.fed = job.rows.fed && job.rows.fed[row];
     f.active = false;
     for (int lane = 0; lane < P::W; ++lane) {
-      const int64_t at = lane < b.lanes ? job.order[b.first + lane] : 0;
+      const int64_t at = lane < b.lanes ? job.source[b.first + lane] : 0;
       const bool alive = lane < b.lanes && row < job.length[b.first + lane];
       f.alive[lane] = alive;
       auto one = [&](const Fact<T>& fact) {
@@ -550,12 +550,12 @@ struct Scan {
       if (!fact.data || !n) return;
       const T* lanes[P::W];
       for (int lane = 0; lane < P::W; ++lane)
-        lanes[lane] = f.alive[lane] != 0 ? fact.data + int64_t(job.order[b.first + lane]) * fact.by_lane +
+        lanes[lane] = f.alive[lane] != 0 ? fact.data + int64_t(job.source[b.first + lane]) * fact.by_lane +
                                                row * fact.by_row
                                          : f.nothing;
       if (more)
         for (int lane = 0; lane < b.lanes; ++lane) {
-          const T* next = fact.data + int64_t(job.order[b.first + lane]) * fact.by_lane +
+          const T* next = fact.data + int64_t(job.source[b.first + lane]) * fact.by_lane +
                           (row + ahead) * fact.by_row;
           for (int u = 0; u < n; u += 64 / int(sizeof(T))) __builtin_prefetch(next + u);
           __builtin_prefetch(next + n - 1);

@@ -3,6 +3,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -304,14 +305,12 @@ Spec spec_of(int channels, int hidden, int anchored, int ages, int cell, bool re
 template <class T>
 struct Call {
   Job<T> job;
-  std::vector<int32_t> order, length;
+  std::vector<int32_t> order, length, source;
   std::vector<Block> blocks;
   std::vector<Slot> slots;
   int64_t tape = 0;
 
-  void plan(const Spec& s, const Body<T>& body, int64_t batch, int64_t rows,
-            const int64_t* lengths) {
-    job.spec = &s;
+  void order_lanes(int64_t batch, int64_t rows, const int64_t* lengths, const int64_t* index) {
     job.batch = batch, job.n_rows = rows;
     order.resize(batch);
     std::iota(order.begin(), order.end(), 0);
@@ -320,7 +319,16 @@ struct Call {
     };
     std::stable_sort(order.begin(), order.end(),
                      [&](int32_t i, int32_t j) { return of(i) > of(j); });
-    for (int32_t i : order) length.push_back(int32_t(of(i)));
+    for (int32_t i : order) {
+      length.push_back(int32_t(of(i)));
+      source.push_back(index ? int32_t(index[i]) : i);
+    }
+    job.order = order.data(), job.length = length.data(), job.source = source.data();
+  }
+
+  void plan(const Spec& s, const Body<T>& body) {
+    job.spec = &s;
+    const int64_t batch = job.batch;
     const int w = body.width;
     for (int64_t at = 0; at < batch;) {
       Block b;
@@ -338,7 +346,6 @@ struct Call {
     const int count = std::min(n, most);
     for (int i = 0; i < count; ++i)
       slots.push_back({int(int64_t(n) * i / count), int(int64_t(n) * (i + 1) / count)});
-    job.order = order.data(), job.length = length.data();
     job.blocks = blocks.data(), job.slots = slots.data();
   }
 
@@ -350,11 +357,12 @@ struct Call {
 };
 
 template <class T>
-int most_steps(const Spec& s, const Fact<T>& gap, int64_t batch, int64_t rows) {
+int most_steps(const Spec& s, const Fact<T>& gap, const std::vector<int32_t>& source,
+               int64_t rows) {
   int64_t most = s.steps;
   if (s.max_step > 0 && s.field.layers) {
     T longest = 0;
-    for (int64_t i = 0; i < batch; ++i)
+    for (int64_t i : source)
       for (int64_t j = 0; j < rows; ++j)
         longest = std::max(longest, gap.data[i * gap.by_lane + j * gap.by_row]);
     const T wanted = std::ceil(longest / T(s.max_step) - T(1e-6));
@@ -365,35 +373,71 @@ int most_steps(const Spec& s, const Fact<T>& gap, int64_t batch, int64_t rows) {
   return int(most);
 }
 
+enum { GAP, UPDATE, UPDATED, VALUES, MASK, AGE, DECAY_START, DECAY_END, DELTA, LAST, QUANTITIES };
+const char* const NAMES[QUANTITIES] = {"gap", "update",      "updated",   "values", "mask",
+                                       "age", "decay_start", "decay_end", "delta",  "last"};
+
+// What is known of the rows: an array per quantity, or one table of many trajectories that has the
+// quantities side by side, and which of its trajectories are meant.
 template <class T>
 struct Facts {
-  Maybe<T> gap, update, updated, values, mask, age, decay_start, decay_end, delta, last, mean;
+  std::vector<Maybe<T>> arrays;
+  Maybe<T> mean;
   std::optional<Const<uint8_t>> fed;
   std::optional<Const<int64_t>> length;
+  Maybe<T> table;  // (trajectories, rows, columns)
+  std::optional<Const<int64_t>> index;
+  std::vector<std::pair<int, int>> places;  // first column and number of columns, 0: none
+  int64_t rows = 0;
+
+  Fact<T> get(int which, int64_t batch, int units) const {
+    if (!table) return needed(NAMES[which], arrays[which], batch, rows, units);
+    const auto [first, width] = places[which];
+    if (!width) refuse(std::string(NAMES[which]) + " is missing; this scan needs it");
+    if (width != std::max(units, 1) || first < 0 || first + width > int64_t(table->shape(2)))
+      refuse(std::string(NAMES[which]) + " must have " + std::to_string(std::max(units, 1)) +
+             " columns inside the table, got columns " + std::to_string(first) + " to " +
+             std::to_string(first + width));
+    return {table->data() + first, table->stride(0), table->stride(1)};
+  }
+
+  // Checks that the table has the trajectories and rows that are asked for.
+  void check_table(int64_t batch) const {
+    check_shape("index", *index, {batch});
+    check_contiguous("index", *index);
+    const int64_t n = int64_t(table->shape(0));
+    for (int64_t i = 0; i < batch; ++i)
+      if (index->data()[i] < 0 || index->data()[i] >= n)
+        refuse("index " + std::to_string(index->data()[i]) + " is not in the table of " +
+               std::to_string(n) + " trajectories");
+    if (rows > int64_t(table->shape(1)) || (table->shape(2) > 1 && table->stride(2) != 1))
+      refuse("the table has shape " + shape_of(*table) + ", expected at least " +
+             std::to_string(rows) + " rows, and columns that lie in one piece");
+  }
 };
 
 template <class T>
-void take_rows(Job<T>& job, const Spec& s, const Facts<T>& f, int64_t batch, int64_t rows) {
+void take_rows(Job<T>& job, const Spec& s, const Facts<T>& f, int64_t batch) {
   Rows<T>& r = job.rows;
-  r.gap = needed("gap", f.gap, batch, rows, -1);
-  r.update = needed("update", f.update, batch, rows, -1);
-  r.values = needed("values", f.values, batch, rows, s.channels);
-  r.mask = needed("mask", f.mask, batch, rows, s.channels);
-  if (s.ages) r.age = needed("age", f.age, batch, rows, s.ages);
+  r.gap = f.get(GAP, batch, -1);
+  r.update = f.get(UPDATE, batch, -1);
+  r.values = f.get(VALUES, batch, s.channels);
+  r.mask = f.get(MASK, batch, s.channels);
+  if (s.ages) r.age = f.get(AGE, batch, s.ages);
   if (s.decay_features) {
-    r.decay_start = needed("decay_start", f.decay_start, batch, rows, s.decay_features);
-    r.decay_end = needed("decay_end", f.decay_end, batch, rows, s.decay_features);
-    r.updated = needed("updated", f.updated, batch, rows, -1);
+    r.decay_start = f.get(DECAY_START, batch, s.decay_features);
+    r.decay_end = f.get(DECAY_END, batch, s.decay_features);
+    r.updated = f.get(UPDATED, batch, -1);
   }
   if (s.input_decay) {
-    r.delta = needed("delta", f.delta, batch, rows, s.channels);
-    r.last = needed("last", f.last, batch, rows, s.channels);
+    r.delta = f.get(DELTA, batch, s.channels);
+    r.last = f.get(LAST, batch, s.channels);
     if (!f.mean) refuse("mean is missing; this scan needs it");
     check_shape("mean", *f.mean, {s.channels});
     r.mean = f.mean->data();
   }
   if (s.decoder.layers && f.fed) {
-    check_shape("fed", *f.fed, {rows});
+    check_shape("fed", *f.fed, {f.rows});
     r.fed = f.fed->data();
   }
 }
@@ -403,19 +447,19 @@ Call<T> prepare(const Spec& s, const Body<T>& body, const Facts<T>& f, const Con
   const int64_t batch = state.ndim() ? int64_t(state.shape(0)) : 0;
   check_shape("state", state, {batch, state_of(s)});
   check_contiguous("state", state);
-  if (!f.gap || f.gap->ndim() != 2) refuse("gap must have shape (batch, rows)");
-  const int64_t rows = int64_t(f.gap->shape(1));
-  if (batch < 1 || rows < 1) refuse("a scan needs at least one trajectory and one row");
+  if (batch < 1 || f.rows < 1) refuse("a scan needs at least one trajectory and one row");
+  if (f.table) f.check_table(batch);
   Call<T> call;
-  take_rows(call.job, s, f, batch, rows);
-  call.job.max_steps = most_steps(s, call.job.rows.gap, batch, rows);
+  take_rows(call.job, s, f, batch);
   const int64_t* lengths = nullptr;
   if (f.length) {
     check_shape("length", *f.length, {batch});
     lengths = f.length->data();
   }
   call.job.state = state.data();
-  call.plan(s, body, batch, rows, lengths);
+  call.order_lanes(batch, f.rows, lengths, f.index ? f.index->data() : nullptr);
+  call.job.max_steps = most_steps(s, call.job.rows.gap, call.source, f.rows);
+  call.plan(s, body);
   // Enough lanes per addition to the gradients, and no more memory than that takes.
   const int evaluations = s.field.layers ? s.stages * call.job.max_steps : 1;
   call.job.group = std::clamp(8 / evaluations, 1, MAX_GROUP);
@@ -591,8 +635,11 @@ void bind(nb::module_& m, const char* suffix) {
              Maybe<T> mask, Maybe<T> age, Maybe<T> decay_start, Maybe<T> decay_end, Maybe<T> delta,
              Maybe<T> last, Maybe<T> mean, std::optional<Const<uint8_t>> fed,
              std::optional<Const<int64_t>> length) {
-            new (self) Facts<T>{gap,       update, updated, values, mask, age, decay_start,
-                                decay_end, delta,  last,    mean,   fed,  length};
+            if (!gap || gap->ndim() != 2) refuse("gap must have shape (batch, rows)");
+            const int64_t rows = int64_t(gap->shape(1));
+            new (self) Facts<T>{{gap, update, updated, values, mask, age, decay_start, decay_end,
+                                 delta, last},
+                                mean, fed, length, {}, {}, {}, rows};
           },
           nb::arg("gap").noconvert(), nb::arg("update").noconvert(),
           nb::arg("updated").noconvert().none(), nb::arg("values").noconvert(),
@@ -600,6 +647,19 @@ void bind(nb::module_& m, const char* suffix) {
           nb::arg("decay_start").noconvert().none(), nb::arg("decay_end").noconvert().none(),
           nb::arg("delta").noconvert().none(), nb::arg("last").noconvert().none(),
           nb::arg("mean").noconvert().none(), nb::arg("fed").noconvert().none(),
+          nb::arg("length").noconvert().none())
+      .def(
+          "__init__",
+          [](Facts<T>* self, Const<T> table, Const<int64_t> index,
+             const std::vector<std::pair<int, int>>& places, int64_t rows, Maybe<T> mean,
+             std::optional<Const<uint8_t>> fed, std::optional<Const<int64_t>> length) {
+            if (table.ndim() != 3 || index.ndim() != 1)
+              refuse("a table must have three axes and its index one");
+            if (places.size() != QUANTITIES) refuse("a table needs a place for every quantity");
+            new (self) Facts<T>{{}, mean, fed, length, table, index, places, rows};
+          },
+          nb::arg("table").noconvert(), nb::arg("index").noconvert(), nb::arg("places"),
+          nb::arg("rows"), nb::arg("mean").noconvert().none(), nb::arg("fed").noconvert().none(),
           nb::arg("length").noconvert().none());
   m.def(
       "tape_size",

@@ -71,6 +71,7 @@ struct Job {
   Rows<T> rows;
   int64_t batch = 0, n_rows = 0;
   const int32_t* order = nullptr;   // lane -> trajectory, longest first
+  const int32_t* source = nullptr;  // lane -> where the facts of its trajectory are
   const int32_t* length = nullptr;  // of each lane
   const Block* blocks = nullptr;
   const Slot* slots = nullptr;

@@ -23,6 +23,7 @@ from offbeat.kernels.spec import (
     ScanRows,
     ScanSpec,
     ScanWeights,
+    TableRows,
 )
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "ScanRows",
     "ScanSpec",
     "ScanWeights",
+    "TableRows",
     "body",
     "perceptron",
     "scan",
@@ -90,7 +92,7 @@ def use(name: str) -> Iterator[str]:
 
 
 def scan(
-    spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor
+    spec: ScanSpec, weights: ScanWeights, rows: ScanRows | TableRows, state: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Carries a batch of states over all rows, in the fused body where it can run the spec.
 
@@ -106,7 +108,7 @@ def scan(
     """
     name = body()[0]
     if name == "reference" or fused.unsupported(spec, weights, rows, state):
-        return reference.scan(spec, weights, rows, state)
+        return reference.scan(spec, weights, rows.gathered(), state)
     return fused.scan(spec, weights, rows, state, name)
 
 

@@ -19,7 +19,14 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from offbeat.kernels.spec import Layers, ScanRows, ScanSpec, ScanWeights
+from offbeat.kernels.spec import (
+    QUANTITIES,
+    Layers,
+    ScanRows,
+    ScanSpec,
+    ScanWeights,
+    TableRows,
+)
 from offbeat.solvers import tableau
 
 try:
@@ -87,7 +94,9 @@ def suffix(dtype: torch.dtype) -> str:
     return _TYPES[dtype]
 
 
-def unsupported(spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor) -> str:
+def unsupported(
+    spec: ScanSpec, weights: ScanWeights, rows: ScanRows | TableRows, state: Tensor
+) -> str:
     """Why the fused body can't run a scan; empty where it can."""
     if compiled is None:
         return f"it was not built ({why_not})"
@@ -99,19 +108,22 @@ def unsupported(spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Ten
         return f"a perceptron has more than {_MOST_LAYERS} layers"
     if state.device.type != "cpu" or state.dtype not in _TYPES:
         return f"the state is {state.dtype} on {state.device}, not float32 or float64 on the CPU"
-    given = (*weights.tensors(), rows.gap, rows.values)
-    if len(given) == 2:
+    trained, known = tuple(weights.tensors()), tuple(rows.known())
+    if not trained:
         return "it has no weights"
-    if any(t.dtype != state.dtype or t.device != state.device for t in given):
+    if any(t.dtype != state.dtype or t.device != state.device for t in (*trained, *known)):
         return "weights, rows and state differ in type or device"
-    facts = (rows.gap, rows.update, rows.values, rows.mask, rows.age, rows.delta, rows.last)
-    if any(t is not None and t.requires_grad for t in facts):
+    if any(t.requires_grad for t in known):
         return "a gradient is asked for of what is known of a row"
     return ""
 
 
 def scan(
-    spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor, body: str | None = None
+    spec: ScanSpec,
+    weights: ScanWeights,
+    rows: ScanRows | TableRows,
+    state: Tensor,
+    body: str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Carries a batch of states over all rows, as `offbeat.kernels.scan`.
 
@@ -168,28 +180,22 @@ def _array(tensor: Tensor | None) -> Any:
     return tensor.detach().numpy()
 
 
-def _facts(rows: ScanRows, suffix: str) -> Any:
-    fed = bytearray(rows.fed) if rows.fed else None
-    return getattr(compiled, f"Facts_{suffix}")(
-        *(
-            _array(fact)
-            for fact in (
-                rows.gap,
-                rows.update,
-                rows.updated,
-                rows.values,
-                rows.mask,
-                rows.age,
-                rows.decay_start,
-                rows.decay_end,
-                rows.delta,
-                rows.last,
-                rows.mean,
-            )
-        ),
-        torch.frombuffer(fed, dtype=torch.uint8).numpy() if fed else None,
-        _array(rows.length),
-    )
+def _facts(rows: ScanRows | TableRows, suffix: str) -> Any:
+    made = getattr(compiled, f"Facts_{suffix}")
+    fed = torch.frombuffer(bytearray(rows.fed), dtype=torch.uint8).numpy() if rows.fed else None
+    if isinstance(rows, TableRows):
+        table = rows.table
+        return made(
+            _array(table.table),
+            _array(rows.index),
+            table.columns,
+            rows.rows,
+            _array(table.mean),
+            fed,
+            _array(rows.length),
+        )
+    facts = (_array(getattr(rows, name)) for name in QUANTITIES)
+    return made(*facts, _array(rows.mean), fed, _array(rows.length))
 
 
 class _Scan(Function):
@@ -197,7 +203,7 @@ class _Scan(Function):
     def forward(
         ctx: Any,
         spec: ScanSpec,
-        rows: ScanRows,
+        rows: ScanRows | TableRows,
         body: str,
         keep: bool,
         packed: Tensor,

@@ -12,7 +12,8 @@ as many memory units when the cell is an LSTM.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -143,6 +144,21 @@ class ScanWeights:
         return torch.cat([tensor.reshape(-1) for tensor in self.tensors()])
 
 
+QUANTITIES = (
+    "gap",
+    "update",
+    "updated",
+    "values",
+    "mask",
+    "age",
+    "decay_start",
+    "decay_end",
+    "delta",
+    "last",
+)
+"""What can be known of each row of each trajectory, in the order of the compiled code."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScanRows:
     """What is known of each row; no weight has touched it.
@@ -188,13 +204,23 @@ class ScanRows:
         """Rows of the longest trajectory."""
         return self.gap.shape[1]
 
+    def gathered(self) -> ScanRows:
+        """These rows; `TableRows` has them in a table."""
+        return self
+
+    def known(self) -> Iterator[Tensor]:
+        """All tensors of numbers that there are."""
+        for fact in QUANTITIES:
+            if (tensor := getattr(self, fact)) is not None:
+                yield tensor
+
 
 @dataclass(frozen=True, eq=False)
 class RowTable:
     """The facts of many trajectories side by side in one tensor, so that a batch is one gather.
 
     Attributes:
-        table: (trajectories, rows, columns).
+        table: (trajectories, rows, columns), the columns in one piece.
         places: of each fact: its name, its columns, and whether it has an axis of units.
         mean: as `ScanRows.mean`.
         length: as `ScanRows.length`.
@@ -212,9 +238,7 @@ class RowTable:
         Args:
             rows: of all trajectories.
         """
-        facts = {f.name: getattr(rows, f.name) for f in fields(rows)}
-        for name in ("mean", "length", "fed"):
-            facts.pop(name)
+        facts = {name: getattr(rows, name) for name in QUANTITIES}
         places, columns, known, width = [], [], {}, 0
         for name, value in facts.items():
             if value is None:
@@ -230,19 +254,53 @@ class RowTable:
     def __len__(self) -> int:
         return len(self.table)
 
-    def take(self, index: Tensor) -> ScanRows:
+    @cached_property
+    def columns(self) -> tuple[tuple[int, int], ...]:
+        """First column and number of columns of each of `QUANTITIES`; of what is missing, none."""
+        where = {name: (at.start, at.stop - at.start) for name, at, _ in self.places}
+        return tuple(where.get(name, (0, 0)) for name in QUANTITIES)
+
+    def take(self, index: Tensor) -> TableRows:
         """Some trajectories, trimmed to the longest of them.
 
         Args:
-            index: (batch,) positions.
+            index: (batch,) positions, int64.
         """
         length = None if self.length is None else self.length.index_select(0, index)
-        table = self.table
-        if length is not None:
-            table = table[:, : int(length.max())]
-        table = table.index_select(0, index)
+        rows = self.table.shape[1] if length is None else int(length.max())
+        return TableRows(self, index, rows, length)
+
+
+@dataclass(frozen=True, eq=False)
+class TableRows:
+    """Rows that lie in a table: the fused body reads them there, others have them gathered.
+
+    Attributes:
+        table: has the rows.
+        index: (batch,) positions of the trajectories in it, int64.
+        rows: of the longest of them.
+        length: (batch,) as `ScanRows.length`.
+        fed: as `ScanRows.fed`.
+    """
+
+    table: RowTable
+    index: Tensor
+    rows: int
+    length: Tensor | None
+    fed: tuple[bool, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def gathered(self) -> ScanRows:
+        """The rows, side by side."""
+        table = self.table.table[:, : self.rows].index_select(0, self.index)
         facts: dict[str, Any] = {
             name: table[..., at] if units else table[..., at.start]
-            for name, at, units in self.places
+            for name, at, units in self.table.places
         }
-        return ScanRows(**facts, mean=self.mean, length=length)
+        return ScanRows(**facts, mean=self.table.mean, length=self.length, fed=self.fed)
+
+    def known(self) -> Iterator[Tensor]:
+        """All tensors of numbers that there are."""
+        yield self.table.table

@@ -18,7 +18,7 @@ from offbeat.data.batch import Batch
 from offbeat.data.prepare import Scaler
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.kernels import ScanRows, ScanSpec, ScanWeights, body, fused, scan
+from offbeat.kernels import ScanRows, ScanSpec, ScanWeights, TableRows, body, fused, scan
 from offbeat.models.ages import Ages, Carry, ages
 from offbeat.models.decay import ExponentialDecay, InputDecay, TrainableDecay
 from offbeat.models.parts import Cell, Perceptron, initialise
@@ -189,7 +189,7 @@ class RecurrentModel(nn.Module):
 
     def run(
         self,
-        rows: ScanRows,
+        rows: ScanRows | TableRows,
         state: Tensor | None = None,
         *,
         coins: torch.Generator | None = None,
