@@ -149,10 +149,14 @@ static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int 
       P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, to_x);
       break;
     }
-    P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, k.z);
-    to_out -= int64_t(shape.sizes[l]) * W;
-    activate_backward<P>(shape.activation, shape.sizes[l], value,
-                         kept + int64_t(n.slope[l - 1]) * W, k.z, to_out);
+    T* to_value = to_out - int64_t(shape.sizes[l]) * W;
+    if (shape.activation == TANH) {
+      P::through_tanh(m, k.c.packed, k.c.lanes, to_out, value, to_value);
+    } else {
+      P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, k.z);
+      activate_backward<P>(shape.sizes[l], kept + int64_t(n.slope[l - 1]) * W, k.z, to_value);
+    }
+    to_out = to_value;
   }
 }
 

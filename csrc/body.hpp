@@ -244,9 +244,23 @@ struct Scan {
 
   // --- affine maps ----------------------------------------------------------------------------------
 
+  // What becomes of a product before it is stored, at an offset of its result.
+  struct Plain {
+    INLINE V operator()(V a, int64_t) const { return a; }
+  };
+  struct TimesTanhSlope {  // that follows from the value of tanh
+    const T* value;
+    INLINE V operator()(V a, int64_t i) const {
+      const V y = load<T>(value + i);
+      return a * fma(-y, y, splat(1));
+    }
+  };
+
   // y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order.
-  template <int NV, bool ACCUMULATE>
-  static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x, T* y) {
+  template <int NV, bool ACCUMULATE, class Finish>
+  static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x, T* y,
+                           int64_t at, const Finish& finish) {
+    y += at;
     constexpr int W = NV * VW;
     V acc[TILE][NV];
     for (int r = 0; r < TILE; ++r)
@@ -266,13 +280,16 @@ struct Scan {
     }
     for (int r = 0; r < TILE; ++r)
       if (r < rows)
-        for (int v = 0; v < NV; ++v) store<T>(y + r * W + v * VW, acc[r][v]);
+        for (int v = 0; v < NV; ++v)
+          store<T>(y + r * W + v * VW, finish(acc[r][v], at + r * W + v * VW));
   }
 
   // The same for `LANES` lanes of a vector that is mostly empty: vectors over the outputs of N panels,
   // so that lanes which are not there cost nothing. They are set to 0.
-  template <int LANES, int N, bool ACCUMULATE>
-  static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y) {
+  template <int LANES, int N, bool ACCUMULATE, class Finish>
+  static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y,
+                                int64_t at, const Finish& finish) {
+    y += at;
     static_assert(TILE == 4, "a panel is four floats wide");
     F4 acc[N][LANES];
     for (int n = 0; n < N; ++n)
@@ -291,17 +308,19 @@ struct Scan {
     for (int o = 0; o < N * TILE && o < rows; ++o) {
       store<T>(y + o * VW, splat(0));
       for (int lane = 0; lane < LANES; ++lane) y[o * VW + lane] = acc[o / TILE][lane][o % TILE];
+      store<T>(y + o * VW, finish(load<T>(y + o * VW), at + o * VW));
     }
   }
-  template <int LANES, int N, bool ACCUMULATE>
-  static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y) {
+  template <int LANES, int N, bool ACCUMULATE, class Finish>
+  static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y,
+                           const Finish& finish) {
     int o = 0;
     for (; o + N * TILE <= out; o += N * TILE)
       few_panels<LANES, N, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, N * TILE, in,
-                                       x, y + int64_t(o) * VW);
+                                       x, y, int64_t(o) * VW, finish);
     for (; o < out; o += TILE)
       few_panels<LANES, 1, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, out - o, in,
-                                       x, y + int64_t(o) * VW);
+                                       x, y, int64_t(o) * VW, finish);
   }
 
   // A policy of lanes: a block of NV vectors of lanes, or the one lane of a stream.
@@ -313,25 +332,32 @@ struct Scan {
     template <bool ACCUMULATE>
     static NOINLINE void affine(const Matrix& m, const T* packed, int lanes, const T* x, T* y) {
       product<ACCUMULATE>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out,
-                          m.in, lanes, x, y);
+                          m.in, lanes, x, y, Plain{});
     }
     // x[k] (+)= sum over o of w[o][k] y[o]
     template <bool ACCUMULATE>
     static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
-      product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x);
+      product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
+                          Plain{});
     }
-    template <bool ACCUMULATE>
+    // The same, times the slope of tanh where its value is `value`.
+    static NOINLINE void through_tanh(const Matrix& m, const T* packed, int lanes, const T* y,
+                                      const T* value, T* x) {
+      product<false>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
+                     TimesTanhSlope{value});
+    }
+    template <bool ACCUMULATE, class Finish>
     static INLINE void product(const T* w, const T* bias, int out, int in, int lanes, const T* x,
-                               T* y) {
+                               T* y, const Finish& finish) {
       if constexpr (NV == 1 && sizeof(T) == 4) {
-        if (lanes == 1) return few<1, 8, ACCUMULATE>(w, bias, out, in, x, y);
-        if (lanes == 2) return few<2, 4, ACCUMULATE>(w, bias, out, in, x, y);
-        if (VW > 4 && lanes == 3) return few<3, 3, ACCUMULATE>(w, bias, out, in, x, y);
-        if (VW > 4 && lanes == 4) return few<4, 3, ACCUMULATE>(w, bias, out, in, x, y);
+        if (lanes == 1) return few<1, 8, ACCUMULATE>(w, bias, out, in, x, y, finish);
+        if (lanes == 2) return few<2, 4, ACCUMULATE>(w, bias, out, in, x, y, finish);
+        if (VW > 4 && lanes == 3) return few<3, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
+        if (VW > 4 && lanes == 4) return few<4, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
       }
       for (int o = 0; o < out; o += TILE)
         panel<NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
-                              out - o < TILE ? out - o : TILE, in, x, y + int64_t(o) * W);
+                              out - o < TILE ? out - o : TILE, in, x, y, int64_t(o) * W, finish);
     }
     template <class Fn>
     static INLINE void each(int units, Fn fn) {
@@ -408,17 +434,9 @@ struct Scan {
       store<T>(value + i, x * s);
     });
   }
-  // to_z = to_value * slope; of tanh the slope follows from the value
+  // to_z = to_value * slope
   template <class P>
-  static NOINLINE void activate_backward(int activation, int units, const T* value, const T* slope,
-                                       const T* to_value, T* to_z) {
-    if (activation == TANH) {
-      P::each(units, [&](int64_t i, int) {
-        const V y = load<T>(value + i);
-        store<T>(to_z + i, load<T>(to_value + i) * fma(-y, y, splat(1)));
-      });
-      return;
-    }
+  static NOINLINE void activate_backward(int units, const T* slope, const T* to_value, T* to_z) {
     P::each(units, [&](int64_t i, int) {
       store<T>(to_z + i, load<T>(to_value + i) * load<T>(slope + i));
     });
