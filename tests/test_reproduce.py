@@ -347,7 +347,7 @@ def test_a_fingerprint_tells_arithmetic_apart_and_nothing_else():
         assert fingerprint.__wrapped__() == own
     finally:
         torch.set_num_threads(before)
-    assert fingerprint(replace(Protocol(), anchored_clip_norm=0.3)) != own
+    assert fingerprint(replace(Protocol(), anchored_learning_rate=0.003)) != own
     if kernels.fused.bodies():
         with kernels.use("reference"):
             assert fingerprint.__wrapped__() != own
