@@ -19,7 +19,7 @@ from scan_problems import CELLS, FLOWS, Problem, largest_error, problem, run
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.kernels import ScanRows, fused, reference
+from offbeat.kernels import RowTable, ScanRows, TableRows, fused, reference
 from offbeat.models.zoo import ZOO
 
 needs_fused = pytest.mark.skipif(not fused.bodies(), reason="the fused body was not built")
@@ -262,6 +262,33 @@ def test_when_gradients_of_weights_are_added_changes_no_bit(
         monkeypatch.setattr(fused, "ROWS_AT_ONCE", rows)
         for key, value in run(lambda *a: fused.scan(*a, body), case).items():
             assert torch.equal(value, expected[key]), (rows, key)
+
+
+@needs_fused
+@bodies
+@pytest.mark.parametrize("name", list(BITS))
+def test_rows_of_a_table_have_the_bits_of_rows_that_are_gathered(name: str, body: str) -> None:
+    case = problem(seed=4, batch=30, rows=12, channels=4, hidden=7, padded=True, **BITS[name])
+    picked = RowTable.of(case.rows).take(torch.tensor([29, 3, 3, 17, 0]))
+    at, rows = picked.index, picked.rows
+    in_place = case._replace(
+        rows=picked,
+        state=case.state[at].detach().requires_grad_(),
+        factors=tuple(factor[at, :rows] for factor in case.factors),
+    )
+    gathered = in_place._replace(rows=picked.gathered())
+    expected = run(lambda *a: fused.scan(*a, body), gathered)
+    for key, value in run(lambda *a: fused.scan(*a, body), in_place).items():
+        assert torch.equal(value, expected[key]), key
+
+
+@needs_fused
+@pytest.mark.parametrize("index", [[0, 30], [-1, 0]])
+def test_an_index_that_is_not_in_the_table_is_refused(index: list[int]) -> None:
+    case = problem(seed=4, batch=30, rows=12, channels=4, hidden=7, **BITS["lstm"])
+    rows = TableRows(RowTable.of(case.rows), torch.tensor(index), 12, None)
+    with pytest.raises(ValueError, match="is not in the table of 30 trajectories"):
+        fused.scan(case.spec, case.weights, rows, case.state[:2])
 
 
 @needs_fused
