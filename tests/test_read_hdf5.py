@@ -223,3 +223,39 @@ def test_a_file_of_robomimic_itself_is_read():
     dataset = read(path)
     assert dataset[0].actions is not None
     assert dataset.meta["labels"][0] == "demo_0"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_data_set_that_minari_wrote_is_read(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    minari = pytest.importorskip("minari")
+    spaces = pytest.importorskip("gymnasium").spaces
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    random = np.random.default_rng(0)
+    observed = [random.normal(size=(n + 1, 4)).astype(np.float32) for n in (20, 21)]
+    acted = [random.normal(size=(n, 2)).astype(np.float32) for n in (20, 21)]
+    buffers = [
+        EpisodeBuffer(
+            id=i,
+            observations=list(observed[i]),
+            actions=list(acted[i]),
+            rewards=[0.0] * len(acted[i]),
+            terminations=[False] * len(acted[i]),
+            truncations=[False] * (len(acted[i]) - 1) + [True],
+            infos={},
+        )
+        for i in range(2)
+    ]
+    minari.create_dataset_from_buffers(
+        "walk/test-v0",
+        buffers,
+        observation_space=spaces.Box(-10, 10, (4,), np.float32),
+        action_space=spaces.Box(-10, 10, (2,), np.float32),
+        data_format="hdf5",
+    )
+    dataset = read(tmp_path / "walk" / "test-v0", rate_hz=20)
+    assert [t.rows for t in dataset] == [21, 22]
+    for trajectory, values in zip(dataset, observed, strict=True):
+        np.testing.assert_array_equal(trajectory.values, values.astype(np.float64))
+        np.testing.assert_allclose(np.diff(trajectory.times), 0.05)
