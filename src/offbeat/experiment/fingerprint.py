@@ -37,7 +37,9 @@ def fingerprint(protocol: Protocol | None = None) -> str:
     """Hash of weights and scores of every model of the protocol, trained for a few steps.
 
     Windows, hidden rows, split, order of batches, coins, optimizer, schedule and scoring are those
-    of the protocol; full batches and one that is not full occur. It takes a few seconds.
+    of the protocol; full batches and one that is not full occur. What no small training meets is
+    not in it: gradients are never as large here as the norm that the anchored model's are cut to.
+    It takes a few seconds.
 
     Args:
         protocol: by default the thesis'.
