@@ -3,45 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
 import struct
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-ROOT = Path(__file__).resolve().parents[1]
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS1.register(
     get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
 )
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-
-
-def shared(*parts):
-    """A real log, out of OFFBEAT_DATA or the folder beside the repository; skips without it."""
-    root = Path(os.environ.get("OFFBEAT_DATA") or ROOT.parent / "shared" / "data")
-    path = root.joinpath(*parts)
-    if not path.exists():
-        pytest.skip(f"{path} is not here")
-    return path
-
-
-def evo(*parts):
-    """A file of the unpacked source of the package evo, at OFFBEAT_EVO; skips without it."""
-    root = os.environ.get("OFFBEAT_EVO")
-    found = [Path(root)] if root else sorted((ROOT.parent / "shared" / "data").glob("evo-*"))
-    path = found[0].joinpath("test", *parts) if found else None
-    if path is None or not path.exists():
-        pytest.skip("the source of the package evo is not here, set OFFBEAT_EVO to its folder")
-    return path
 
 
 def stamp(types, nanoseconds):

@@ -8,7 +8,7 @@ import shlex
 import numpy as np
 import pytest
 from PIL import Image
-from robot_logs import shared
+from real_logs import shared
 
 from offbeat.cli import main
 from offbeat.data.advice import advise

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import robot_logs as logs
+from real_logs import ROOT, shared
 
 from offbeat.data.readers import hdf5, read
 from offbeat.errors import FileFormatError, InputError, MissingExtraError
@@ -143,7 +144,7 @@ class TestMinari:
 
     def test_written_by_minari_itself_is_read(self):
         rng = np.random.default_rng(0)  # tests/data/README.md
-        dataset = read(logs.ROOT / "tests" / "data" / "minari")
+        dataset = read(ROOT / "tests" / "data" / "minari")
         assert dataset.names == (
             "achieved_goal[0]", "achieved_goal[1]",
             "observation[0]", "observation[1]", "observation[2]",
@@ -219,7 +220,7 @@ class TestDamage:
 
 
 def test_a_file_of_robomimic_itself_is_read():
-    path = logs.shared("robomimic", "test.hdf5")
+    path = shared("robomimic", "test.hdf5")
     dataset = read(path)
     assert dataset[0].actions is not None
     assert dataset.meta["labels"][0] == "demo_0"

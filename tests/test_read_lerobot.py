@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import robot_logs as logs
+from real_logs import ROOT, shared
 
 from offbeat.data.readers import lerobot, read
 from offbeat.errors import FileFormatError, InputError
@@ -206,7 +207,7 @@ class TestDamage:
 
 
 def test_a_set_of_a_real_robot_is_read():
-    path = logs.shared("unitree_g1_lerobot_v21")
+    path = shared("unitree_g1_lerobot_v21")
     dataset = read(path)
     assert (len(dataset), dataset.channels) == (100, 26)
     assert sum(t.rows for t in dataset) == 35_965
@@ -219,7 +220,7 @@ def test_a_set_of_a_real_robot_is_read():
 
 def test_a_set_that_lerobot_wrote_itself_is_read():
     rng = np.random.default_rng(0)  # tests/data/README.md
-    dataset = read(logs.ROOT / "tests" / "data" / "lerobot_v3")
+    dataset = read(ROOT / "tests" / "data" / "lerobot_v3")
     assert (dataset.names, dataset.meta["actions"]) == (("hip", "knee", "ankle"), ["left", "right"])
     assert [t.rows for t in dataset] == [6, 9]
     for trajectory in dataset:

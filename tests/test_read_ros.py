@@ -12,6 +12,7 @@ import pytest
 import robot_logs as logs
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from real_logs import evo
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores
@@ -467,7 +468,7 @@ def test_a_layout_finds_every_number_of_any_message(fields, seed, cdr, little):
     ],
 )
 def test_logs_of_other_programs_read_as_rosbags_reads_them(name, topics):
-    path = logs.evo(name)
+    path = evo(name)
     expected = {topic: ([], []) for topic in topics}
     with AnyReader([path]) as reader:
         for topic in topics:  # one by one, for chunks that alternate make rosbags slow
@@ -492,7 +493,7 @@ def test_logs_of_other_programs_read_as_rosbags_reads_them(name, topics):
 
 @pytest.mark.parametrize("name", ["data/tf_example.bag", "data/tf_example"])
 def test_transforms_of_other_programs_are_read(name):
-    (trajectory,) = read(logs.evo(name))
+    (trajectory,) = read(evo(name))
     assert trajectory.rows == 517
     assert trajectory.names[0] == "transform.translation.x"
     lengths = np.linalg.norm(trajectory.values[:, 3:], axis=1)

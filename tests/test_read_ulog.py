@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import robot_logs as logs
 from pyulog import ULog
+from real_logs import shared
 
 from offbeat.data.readers import read, ulog
 from offbeat.errors import FileFormatError, InputError, MissingExtraError
@@ -180,7 +181,7 @@ def test_without_the_extra_says_which_one(write, monkeypatch):
 
 @pytest.mark.parametrize("name", ["sample.ulg", "sample_log_small.ulg"])
 def test_a_log_of_px4_reads_as_pyulog_reads_it(name):
-    path = logs.shared("px4_ulog", name)
+    path = shared("px4_ulog", name)
     expected = {d.name: d for d in ULog(str(path)).data_list if d.multi_id == 0}
     recording = one(path)
     assert {"sensor_combined", "vehicle_attitude"} <= {s.name for s in recording.signals}
@@ -192,7 +193,7 @@ def test_a_log_of_px4_reads_as_pyulog_reads_it(name):
 
 
 def test_the_faults_of_a_real_log_are_what_its_readme_says():
-    recording = one(logs.shared("px4_ulog", "sample.ulg"))
+    recording = one(shared("px4_ulog", "sample.ulg"))
     gyros = next(s for s in recording.signals if s.name == "sensor_combined")
     assert len(gyros.stamps) == 17_070
     assert np.diff(gyros.stamps).max() / 1e9 == pytest.approx(0.065, abs=0.002)

@@ -10,7 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from log_writers import OPTIONS, WRITERS, evo, shared
+from log_writers import OPTIONS, WRITERS
+from real_logs import evo, shared
 
 from offbeat.data.readers import POLICIES, READERS, options_of, read
 from offbeat.data.trajectory import Dataset
