@@ -321,6 +321,19 @@ def test_the_distance_from_the_thesis_is_in_its_standard_deviations(record):
     assert [c.value for c in facts["Mean square of row 0, c"]] == pytest.approx([made.CONSTANT] * 4)
 
 
+def test_the_constant_that_is_needed_gives_the_mean_of_the_thesis(record):
+    table = tables_beyond.distance_table(record, number="A.1")
+    for (_, cells), model in zip(table.blocks[2].rows, thesis.MODELS, strict=True):
+        for cell, fraction, (mean, _) in zip(
+            cells, thesis.FRACTIONS, thesis.TEST_RMSE[model], strict=True
+        ):
+            runs = record.where(experiment=2, model=model, fraction=fraction)
+            rest = record.values("rows_1_99_mse", runs).astype(float) * 0.99
+            share = record.values("hidden_rows_0_share", runs).astype(float) / 100
+            reached = np.sqrt(rest + (cell.value or 0.0) * share).mean()
+            assert reached == pytest.approx(mean) if cell.value else reached > mean
+
+
 def test_the_first_row_explains_the_published_score_and_a_slip_shows(record):
     assert tables_beyond.constant_residual(record) < 1e-12
     score = 1.01 * record.runs["published_mse"][5]

@@ -1,0 +1,103 @@
+"""What makes a plain GRU fair: where it updates and which age it is given, at the protocol's size.
+
+    OMP_NUM_THREADS=1 python benchmarks/fair_gru.py --out results/benchmarks/fair_gru.json
+
+Experiment 2 of the protocol at one observed fraction and one repeat: the windows, hidden rows,
+split, order of batches and initial weights of the record's fair GRU, without self-feeding. Only the
+rows at which the cell acts, and its age input, differ from variant to variant (`update_rows` and
+`age_input` of `ModelConfig`). A variant whose result is in the file already is not trained again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import machine, write
+
+import offbeat as ob
+from offbeat.evaluation import LAST_VALUE
+from offbeat.experiment.protocol import Protocol
+
+VARIANTS = (
+    ("every", "delta"),  # the record's fair GRU
+    ("observed", "none"),
+    ("observed", "gap"),
+    ("observed", "delta"),
+    ("every", "none"),
+    ("every", "elapsed"),
+)
+
+
+def trained(
+    protocol: Protocol, parts: tuple[ob.Dataset, ...], scaler: ob.Scaler, run: Any, variant: Any
+) -> dict[str, Any]:
+    """Trains one variant and scores it."""
+    train, validation, test = parts
+    update_rows, age_input = variant
+    config = replace(protocol.model_config(run.model), update_rows=update_rows, age_input=age_input)
+    model = ob.make(config, train, scaler=scaler, seed=run.seed_weights)
+    started = time.perf_counter()
+    fitted = ob.fit(model, train, validation, protocol.train_config(run), progress=False)
+    scores = ob.evaluate({"gru": model}, test, seed=run.seed_draw).scores
+    return {
+        "update_rows": update_rows,
+        "age_input": age_input,
+        "epochs": run.epochs,
+        "published_rmse": scores["gru"].published.rmse,
+        "honest_rmse": scores["gru"].honest.rmse,
+        "last_value_honest_rmse": scores[LAST_VALUE].honest.rmse,
+        "validation_honest_mse": [record.validation_honest_mse for record in fitted.history],
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def main() -> None:
+    """Trains what is missing, and prints all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--fraction", type=float, default=0.3)
+    parser.add_argument("--repeat", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/fair_gru.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+
+    protocol = Protocol()
+    asked = (2, "gru_fair", arguments.fraction, arguments.repeat)
+    run = next(
+        run
+        for run in protocol.runs()
+        if (run.experiment, run.model, run.observed_fraction, run.repeat) == asked
+    )
+    key = {"fraction": arguments.fraction, "repeat": arguments.repeat}
+    kept: list[dict[str, Any]] = []
+    if arguments.out.exists():
+        kept = json.loads(arguments.out.read_text(encoding="utf-8"))["runs"]
+    todo = [
+        variant
+        for variant in VARIANTS
+        if not any({**row, **key, "update_rows": variant[0], "age_input": variant[1]} == row
+                   for row in kept)
+    ]  # fmt: skip
+    if todo:
+        recorded = protocol.simulate(progress=False)
+        scaler = ob.Scaler.fit(protocol.scaler, recorded)
+        parts = protocol.cut(recorded, run)
+    for variant in todo:
+        kept.append({**key, **trained(protocol, parts, scaler, run, variant)})
+        write(str(arguments.out), {"machine": machine(), "runs": kept})
+    for row in kept:
+        print(
+            f"{row['fraction']:.0%} repeat {row['repeat']}  update {row['update_rows']:8}"
+            f"  age {row['age_input']:8}  published {row['published_rmse']:.4f}"
+            f"  honest {row['honest_rmse']:.4f}  last value {row['last_value_honest_rmse']:.4f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""What another draw of initial states does to the units of the thesis' scores.
+
+    python benchmarks/row_0_constant.py --draws 12 --out results/benchmarks/row_0_constant.json
+
+`divide_by_max` divides by the largest single frame of a channel, so its units, and with them c, the
+mean square of row 0, and every error, follow from a handful of frames. For each draw of 10,000
+initial states: c, and the RMSE of repeating the last observed value, which no training can move.
+The first draw is the protocol's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import machine, write
+
+import offbeat as ob
+from offbeat.evaluation import LAST_VALUE
+from offbeat.experiment.protocol import Protocol
+
+
+def measured(protocol: Protocol) -> dict[str, Any]:
+    """c and the scores of the last value, for the draw of a protocol."""
+    recorded = protocol.simulate(progress=False)
+    scaler = ob.Scaler.fit(protocol.scaler, recorded)
+    found: dict[str, Any] = {"state_seed": protocol.state_seed, "last_value": {}}
+    for run in protocol.runs():
+        if (run.experiment, run.model, run.repeat) != (2, "gru", 0):
+            continue
+        train, _, test = protocol.cut(recorded, run)
+        model = ob.make(protocol.model_config("gru"), train, scaler=scaler, seed=0)
+        if "c" not in found:
+            rows = np.stack([scaler.scaled(t.values[:1])[0] for t in (*train, *test)])
+            found["c"] = float((rows**2).mean())
+        scores = ob.evaluate({"gru": model}, test, seed=0).scores[LAST_VALUE]
+        found["last_value"][str(run.observed_fraction)] = {
+            name: getattr(scores, name).rmse for name in ("published", "rows_1_99", "honest")
+        }
+    return found
+
+
+def main() -> None:
+    """Measures the draws that are missing, and prints all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=12)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/row_0_constant.json"))
+    arguments = parser.parse_args()
+    protocol = Protocol()
+    kept: list[dict[str, Any]] = []
+    if arguments.out.exists():
+        kept = json.loads(arguments.out.read_text(encoding="utf-8"))["draws"]
+    for seed in (protocol.state_seed, *range(arguments.draws - 1)):
+        if all(draw["state_seed"] != seed for draw in kept):
+            kept.append(measured(replace(protocol, state_seed=seed)))
+            write(str(arguments.out), {"machine": machine(), "draws": kept})
+    for draw in kept:
+        shown = "  ".join(
+            f"{float(p):.0%} {scores['published']:.4f} ({scores['honest']:.4f})"
+            for p, scores in draw["last_value"].items()
+        )
+        print(f"seed {draw['state_seed']:4}  c {draw['c']:.3f}  last value {shown}")
+
+
+if __name__ == "__main__":
+    main()
