@@ -25,7 +25,7 @@ from offbeat.experiment.protocol import Protocol
 
 
 def measured(protocol: Protocol) -> dict[str, Any]:
-    """c and the scores of the last value, for the draw of a protocol."""
+    """The constant and the scores of the last value, for the draw of a protocol."""
     recorded = protocol.simulate(progress=False)
     scaler = ob.Scaler.fit(protocol.scaler, recorded)
     found: dict[str, Any] = {"state_seed": protocol.state_seed, "last_value": {}}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import record_helpers as made
 
-from offbeat.report import claims, findings, pairing, stability
+from offbeat.report import claims, convergence, findings, pairing, stability
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.findings import FAILS, HOLDS, MISSING, NOT_CONTRADICTED, PARTLY, UNDECIDED
 from offbeat.report.records import Record
@@ -122,7 +122,7 @@ def test_models_that_need_the_same_epochs_are_not_told_apart():
     record = made.synthetic(repeats=4, epochs=2, fractions=thesis.FRACTIONS, experiments=(2,))
     flat = {**record.curves, "validation_honest_mse": np.ones(len(record.curves["epoch"]))}
     record = Record(record.runs, flat, "flat")
-    verdict = stability.speed_verdicts(record)["Honest scoring"]
+    verdict = convergence.speed_verdicts(record)["Honest scoring"]
     assert verdict.word == UNDECIDED
     assert "they need the same epochs in all 4 repeats" in verdict.evidence[1]
 
@@ -155,7 +155,7 @@ def test_not_being_told_apart_is_no_proof():
 
 def test_the_faster_model_is_found_from_the_curves(record):
     # Half of what is left to learn takes ODE-GRU-D 12 epochs and ODE-RNN 30.
-    verdict = stability.speed_verdicts(record)["Published scoring"]
+    verdict = convergence.speed_verdicts(record)["Published scoring"]
     assert verdict.word == HOLDS
     assert "ODE-GRU-D settles in fewer epochs than ODE-RNN" in verdict.evidence[1]
     assert "In experiment 1" in verdict.evidence[-1]
@@ -163,24 +163,24 @@ def test_the_faster_model_is_found_from_the_curves(record):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(made, "HALVING", slower)
         other = made.synthetic(repeats=6, epochs=60)
-    assert stability.speed_verdicts(other)["Published scoring"].word == FAILS
+    assert convergence.speed_verdicts(other)["Published scoring"].word == FAILS
 
 
 def test_whether_the_chosen_epochs_are_enough_is_read_from_longer_runs():
     record = made.synthetic(repeats=1, epochs=300)
-    verdict = stability.enough_verdicts(record)["Honest scoring"]
+    verdict = convergence.enough_verdicts(record)["Honest scoring"]
     assert len(verdict.evidence) == 16
     ours = record.curve("e1-ode_gru_d-90-r00")["validation_honest_mse"]
     (said,) = [e for e in verdict.evidence if e.startswith(f"At 90{PERCENT}, ODE-GRU-D")]
     assert f"the error is {ours[74] / ours[-1]:.2f} times that after 300" in said
     assert verdict.word == FAILS  # GRU halves what is left in 40 epochs, ODE-RNN in 30
-    short = stability.enough_verdicts(made.synthetic(repeats=1, epochs=20))["Honest scoring"]
+    short = convergence.enough_verdicts(made.synthetic(repeats=1, epochs=20))["Honest scoring"]
     assert short.word == MISSING
 
 
 def test_the_steadiest_model_is_found_from_the_spread():
     record = made.synthetic(repeats=10, epochs=2, experiments=(2,))
-    found = {scoring: stability.spreads(record, scoring) for scoring in stability.SCORINGS}
+    found = {scoring: stability.spreads(record, scoring) for scoring in findings.SCORINGS}
     verdict = stability.spread_verdicts(found)["Honest scoring"]
     assert len(verdict.evidence) == 1 + 3 * 4
     told = [s for s in found["honest"] if s.model in thesis.MODELS and s.p <= 0.05]
@@ -194,9 +194,9 @@ def test_every_conclusion_of_the_thesis_gets_a_finding(record):
     families = {
         (name, scoring): pairing.family(record, name, scoring)
         for name in pairing.FAMILIES
-        for scoring in claims.SCORINGS
+        for scoring in findings.SCORINGS
     }
-    rules = {scoring: pairing.thesis_rule(record, scoring) for scoring in claims.SCORINGS}
+    rules = {scoring: pairing.thesis_rule(record, scoring) for scoring in findings.SCORINGS}
     none = {"Published scoring": findings.Verdict(MISSING, ())}
     found = claims.of_the_thesis(families, rules, spread=none, convergence=none, enough=none)
     assert [f.claim for f in found] == list(thesis.CONCLUSIONS.values())

@@ -9,7 +9,7 @@ import record_helpers as made
 
 import offbeat
 from offbeat import cli
-from offbeat.report import circumstances, findings, stability
+from offbeat.report import circumstances, convergence, findings
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.circumstances import Circumstances
 from offbeat.report.contents import Contents
@@ -175,7 +175,7 @@ class _Still:
 
 
 def test_epochs_of_a_known_curve_are_those_of_its_closed_form(falling):
-    by = {one.model: one for one in stability.choices(falling, "honest") if one.fraction == 0.9}
+    by = {one.model: one for one in convergence.choices(falling, "honest") if one.fraction == 0.9}
     for model, half in made.HALVING.items():
         left = 4 * 0.5 ** (300 / half)
         settled = int(np.ceil(half * np.log2(4 / (0.05 * (1 + left) + left))))
@@ -183,7 +183,7 @@ def test_epochs_of_a_known_curve_are_those_of_its_closed_form(falling):
         assert (one.reached, one.settled, one.epochs) == (settled, settled, 300)
         assert one.ratio == pytest.approx((1 + 4 * 0.5 ** (75 / half)) / (1 + left))
         assert one.follows == (settled <= 75)
-    table = stability.choice_table(falling, number="A.13")
+    table = convergence.choice_table(falling, number="A.13")
     cells = dict(table.blocks[1].rows)["ODE-GRU-D"]
     assert cells[0].text == f"{by['ode_gru_d'].ratio:.2f} (76, 76)"  # one epoch after the choice
     assert not cells[0].bold
@@ -191,7 +191,7 @@ def test_epochs_of_a_known_curve_are_those_of_its_closed_form(falling):
 
 
 def test_a_curve_that_still_falls_is_said_to(falling):
-    said = " ".join(stability.speed_verdicts(falling)["Honest scoring"].evidence)
+    said = " ".join(convergence.speed_verdicts(falling)["Honest scoring"].evidence)
 
     def trend(half):
         epochs = np.arange(66, 76)
@@ -206,12 +206,12 @@ def test_when_one_model_is_as_good_as_the_other_becomes_is_told(falling):
     # 0.00066 (1 + 4 / 2^(e / 12)) falls below 0.00073 (1 + 4 / 2^(75 / 30)).
     end = 0.00073 * (1 + 4 * 0.5 ** (75 / 30))
     epoch = int(np.ceil(12 * np.log2(4 / (end / 0.00066 - 1))))
-    said = " ".join(stability.speed_verdicts(falling)["Honest scoring"].evidence)
+    said = " ".join(convergence.speed_verdicts(falling)["Honest scoring"].evidence)
     assert f"90{PERCENT}: in 3 of 3 repeats, median epoch {epoch}" in said
 
 
 def test_the_margin_that_the_constant_leaves_is_told(falling):
-    note = stability.speed_table(falling, number="A.12").notes[-2]
+    note = convergence.speed_table(falling, number="A.12").notes[-2]
     at = falling.where(experiment=2, model="ode_gru_d", fraction=0.9)
     share = made.CONSTANT * 0.1 / 100 / falling.values("published_mse", at).mean()
     assert f"{100 * share:.0f}{PERCENT} at 90{PERCENT}" in note

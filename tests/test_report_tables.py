@@ -12,7 +12,15 @@ import record_helpers as made
 from scipy import stats
 
 from offbeat.errors import InputError
-from offbeat.report import pairing, stability, tables, tables_beyond, tables_tests
+from offbeat.report import (
+    convergence,
+    findings,
+    pairing,
+    stability,
+    tables,
+    tables_beyond,
+    tables_tests,
+)
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.table import MIXED, Block, Cell, Table, bold_lowest
 
@@ -351,7 +359,7 @@ def test_run_times_are_summed_in_minutes_and_per_step(record):
 
 
 def test_a_run_has_settled_when_it_stays_within_5_percent_of_its_end(record):
-    table = stability.speed_table(record, number="A.11")
+    table = convergence.speed_table(record, number="A.11")
     cell = rows_of(table, "Experiment 1, honest scoring")["ODE-GRU-D"][3]
     curve = record.curve("e1-ode_gru_d-30-r00")["validation_honest_mse"]
     away = np.flatnonzero(curve > 1.05 * curve[-1])
@@ -361,7 +369,7 @@ def test_a_run_has_settled_when_it_stays_within_5_percent_of_its_end(record):
 
 
 def test_the_spread_table_has_ours_over_the_others(record):
-    found = {scoring: stability.spreads(record, scoring) for scoring in stability.SCORINGS}
+    found = {scoring: stability.spreads(record, scoring) for scoring in findings.SCORINGS}
     table = stability.spread_table(record, found, number="A.10")
     cell = rows_of(table, "Ours, honest scoring")["ODE-RNN"][0]
     mine, other = (rmse(record, m, 0.9, "honest").std(ddof=1) for m in ("ode_gru_d", "ode_rnn"))

@@ -13,7 +13,6 @@ from offbeat.report.tables import label
 Families = Mapping[tuple[str, str], Sequence[Pair]]
 """Paired comparisons by name of the family and scoring."""
 
-SCORINGS = {"published": "Published scoring", "honest": "Honest scoring"}
 _SPARSE = (0.5, 0.3)
 
 
@@ -36,7 +35,7 @@ def of_the_thesis(
     """
     signs = {fraction: 1 if fraction == 0.9 else -1 for fraction in thesis.FRACTIONS}
     significant = {}
-    for scoring, name in SCORINGS.items():
+    for scoring, name in say.SCORINGS.items():
         pairs = families["ode_models", scoring]
         significant[f"{name}, the thesis' rule"] = say.rule_significance(rules[scoring], _SPARSE)
         significant[f"{name}, paired tests"] = say.significance(pairs, _SPARSE)
@@ -103,4 +102,4 @@ def _finding(number: str, verdicts: Mapping[str, Verdict]) -> Finding:
 def _each(
     families: Families, name: str, judge: Callable[[Sequence[Pair]], Verdict]
 ) -> dict[str, Verdict]:
-    return {shown: judge(families[name, scoring]) for scoring, shown in SCORINGS.items()}
+    return {shown: judge(families[name, scoring]) for scoring, shown in say.SCORINGS.items()}

@@ -7,7 +7,15 @@ from functools import cached_property
 
 from offbeat.errors import MissingExtraError
 from offbeat.experiment.illustrations import Illustrations
-from offbeat.report import claims, stability, tables, tables_beyond, tables_tests
+from offbeat.report import (
+    claims,
+    convergence,
+    findings,
+    stability,
+    tables,
+    tables_beyond,
+    tables_tests,
+)
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.circumstances import Circumstances, broken_pairs, mixing
 from offbeat.report.figure_boxes import boxes_figure
@@ -53,7 +61,7 @@ class Contents:
         return {
             (name, scoring): family(self.record, name, scoring)
             for name in FAMILIES
-            for scoring in claims.SCORINGS
+            for scoring in findings.SCORINGS
         }
 
     @cached_property
@@ -62,7 +70,7 @@ class Contents:
         return {
             (other, scoring): thesis_rule(self.record, scoring, a=other)
             for other in ("ode_rnn", tables.LAST_VALUE)
-            for scoring in claims.SCORINGS
+            for scoring in findings.SCORINGS
         }
 
     @cached_property
@@ -73,19 +81,19 @@ class Contents:
     @cached_property
     def spreads(self) -> Mapping[str, tuple[stability.Spread, ...]]:
         """The spread of ODE-GRU-D beside that of the others, by scoring."""
-        return {scoring: stability.spreads(self.record, scoring) for scoring in claims.SCORINGS}
+        return {scoring: stability.spreads(self.record, scoring) for scoring in findings.SCORINGS}
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
         """The thesis' conclusions, then what it did not ask."""
-        rules = {scoring: self.rules["ode_rnn", scoring] for scoring in claims.SCORINGS}
+        rules = {scoring: self.rules["ode_rnn", scoring] for scoring in findings.SCORINGS}
         return (
             *claims.of_the_thesis(
                 self.families,
                 rules,
                 spread=stability.spread_verdicts(self.spreads),
-                convergence=stability.speed_verdicts(self.record),
-                enough=stability.enough_verdicts(self.record),
+                convergence=convergence.speed_verdicts(self.record),
+                enough=convergence.enough_verdicts(self.record),
             ),
             *claims.beyond_the_thesis(self.families),
         )
@@ -116,7 +124,7 @@ class Contents:
                     record,
                     {
                         shown: self.families[name, scoring]
-                        for scoring, shown in claims.SCORINGS.items()
+                        for scoring, shown in findings.SCORINGS.items()
                     },
                     number=number,
                     caption=caption,
@@ -124,8 +132,8 @@ class Contents:
                 for number, name, caption in _FAMILY_TABLES
             ),
             stability.spread_table(record, self.spreads, number="A.11"),
-            stability.speed_table(record, number="A.12"),
-            stability.choice_table(record, number="A.13"),
+            convergence.speed_table(record, number="A.12"),
+            convergence.choice_table(record, number="A.13"),
             tables_beyond.runs_table(record, repeats=repeats, number="A.14"),
             tables_beyond.cost_table(record, number="A.15"),
         ]

@@ -11,6 +11,9 @@ from offbeat.report.statistics import Estimate
 from offbeat.report.tables import label, percent
 from offbeat.report.tables_tests import SCORING_NAMES, signed
 
+SCORINGS = {"published": "Published scoring", "honest": "Honest scoring"}
+"""Under which conclusions are judged."""
+
 HOLDS = "holds"
 PARTLY = "holds in part"
 FAILS = "does not hold"

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from offbeat.report import claims, stability
 from offbeat.report import findings as say
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.circumstances import machine_facts, time_facts
@@ -104,10 +103,10 @@ def _conclusions(contents: Contents) -> Iterable[str]:
     rows = []
     for finding in contents.findings:
         by = {name: _verdict(v) for name, v in finding.verdicts.items()}
-        if set(by) == set(claims.SCORINGS.values()):
+        if set(by) == set(say.SCORINGS.values()):
             rows.append((finding.claim, finding.source, *by.values()))
             continue
-        scored: dict[str, list[str]] = {shown: [] for shown in claims.SCORINGS.values()}
+        scored: dict[str, list[str]] = {shown: [] for shown in say.SCORINGS.values()}
         for name, words in by.items():
             for shown, mine in scored.items():
                 if name.startswith(shown):
@@ -116,7 +115,7 @@ def _conclusions(contents: Contents) -> Iterable[str]:
             rows.append((finding.claim, finding.source, *map("; ".join, scored.values())))
         else:  # judged per model, under honest scoring
             rows.append((finding.claim, finding.source, DASH, _grouped(by)))
-    yield _grid(("Claim", "Source", *claims.SCORINGS.values()), rows)
+    yield _grid(("Claim", "Source", *say.SCORINGS.values()), rows)
     yield (
         "Verdicts follow from paired tests; 'the thesis' rule' is its own choice of tests, which "
         "takes the runs to be independent. 'Not decided': the tests tell nothing apart, which is "
@@ -174,7 +173,7 @@ def _constant(contents: Contents) -> Iterable[str]:
 
 def _self_feeding(contents: Contents) -> Iterable[str]:
     yield "## What self-feeding does, and what is left of the ODE models' advantage"
-    for scoring, shown in claims.SCORINGS.items():
+    for scoring, shown in say.SCORINGS.items():
         fed = _by_key(contents, "self_feeding", scoring)
         plain = _by_key(contents, "against_plain", scoring)
         fair = _by_key(contents, "against_fair", scoring)
@@ -247,7 +246,7 @@ def _verdicts(contents: Contents, number: str, *, evidence: bool) -> Iterable[st
 
 def _stability(contents: Contents) -> Iterable[str]:
     yield "## Stability"
-    for scoring, shown in stability.SCORINGS.items():
+    for scoring, shown in say.SCORINGS.items():
         by = {(one.model, one.fraction): one for one in contents.spreads[scoring]}
         rows = []
         for model in MODELS:
