@@ -4,8 +4,9 @@
 
 Experiment 2 of the protocol at one observed fraction and one repeat: the windows, hidden rows,
 split, order of batches and initial weights of the record's fair GRU, without self-feeding. Only the
-rows at which the cell acts, and its age input, differ from variant to variant (`update_rows` and
-`age_input` of `ModelConfig`). A variant whose result is in the file already is not trained again.
+rows at which the cell acts, its age input and the unit of that differ from variant to variant
+(`update_rows`, `age_input` and `age_unit` of `ModelConfig`). A variant whose result is in the file
+already is not trained again.
 """
 
 from __future__ import annotations
@@ -22,32 +23,36 @@ from common import machine, write
 
 import offbeat as ob
 from offbeat.evaluation import LAST_VALUE
-from offbeat.experiment.protocol import Protocol
+from offbeat.experiment.protocol import Protocol, Run
 
 VARIANTS = (
-    ("every", "delta"),  # the record's fair GRU
-    ("observed", "none"),
-    ("observed", "gap"),
-    ("observed", "delta"),
-    ("every", "none"),
-    ("every", "elapsed"),
+    {"update_rows": "observed", "age_input": "none", "age_unit": "gap"},
+    {"update_rows": "observed", "age_input": "gap", "age_unit": "gap"},  # `gru_unfed`
+    {"update_rows": "observed", "age_input": "delta", "age_unit": "gap"},
+    {"update_rows": "observed", "age_input": "delta", "age_unit": "longest"},
+    {"update_rows": "every", "age_input": "none", "age_unit": "gap"},
+    {"update_rows": "every", "age_input": "elapsed", "age_unit": "gap"},
+    {"update_rows": "every", "age_input": "delta", "age_unit": "gap"},
+    {"update_rows": "every", "age_input": "delta", "age_unit": "longest"},  # `gru_fair`
 )
 
 
 def trained(
-    protocol: Protocol, parts: tuple[ob.Dataset, ...], scaler: ob.Scaler, run: Any, variant: Any
+    protocol: Protocol,
+    parts: tuple[ob.Dataset, ...],
+    scaler: ob.Scaler,
+    run: Run,
+    variant: dict[str, Any],
 ) -> dict[str, Any]:
     """Trains one variant and scores it."""
     train, validation, test = parts
-    update_rows, age_input = variant
-    config = replace(protocol.model_config(run.model), update_rows=update_rows, age_input=age_input)
+    config = replace(protocol.model_config(run.model), **variant)
     model = ob.make(config, train, scaler=scaler, seed=run.seed_weights)
     started = time.perf_counter()
     fitted = ob.fit(model, train, validation, protocol.train_config(run), progress=False)
     scores = ob.evaluate({"gru": model}, test, seed=run.seed_draw).scores
     return {
-        "update_rows": update_rows,
-        "age_input": age_input,
+        **variant,
         "epochs": run.epochs,
         "published_rmse": scores["gru"].published.rmse,
         "honest_rmse": scores["gru"].honest.rmse,
@@ -79,11 +84,8 @@ def main() -> None:
     if arguments.out.exists():
         kept = json.loads(arguments.out.read_text(encoding="utf-8"))["runs"]
     todo = [
-        variant
-        for variant in VARIANTS
-        if not any({**row, **key, "update_rows": variant[0], "age_input": variant[1]} == row
-                   for row in kept)
-    ]  # fmt: skip
+        variant for variant in VARIANTS if not any({**row, **key, **variant} == row for row in kept)
+    ]
     if todo:
         recorded = protocol.simulate(progress=False)
         scaler = ob.Scaler.fit(protocol.scaler, recorded)
@@ -94,7 +96,8 @@ def main() -> None:
     for row in kept:
         print(
             f"{row['fraction']:.0%} repeat {row['repeat']}  update {row['update_rows']:8}"
-            f"  age {row['age_input']:8}  published {row['published_rmse']:.4f}"
+            f"  age {row['age_input']:8} in {row['age_unit']:8}"
+            f"  published {row['published_rmse']:.4f}"
             f"  honest {row['honest_rmse']:.4f}  last value {row['last_value_honest_rmse']:.4f}"
         )
 

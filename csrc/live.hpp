@@ -6,7 +6,7 @@
 enum Age { AGE_NONE, AGE_ELAPSED, AGE_GAP, AGE_DELTA };
 
 struct Clockwork {  // how a model reads time; all in s
-  double unit = 1, median_gap = 1, elapsed_limit = 1, longest_delta = 1;
+  double unit = 1, age_unit = 1, elapsed_limit = 1, longest_delta = 1;
   int age = AGE_NONE;
   bool from_first_row = false, last_row = false, every_row = false, starts_only = false;
   bool exponential = false;  // the decay is made from elapsed time, not from ages
@@ -148,13 +148,13 @@ class Live {
         delta_[c] = T(delta / clock_.unit);
         if (!clock_.exponential) start_[c] = T(delta_before / clock_.unit), end_[c] = delta_[c];
         if (clock_.age == AGE_DELTA)
-          age_[c] = T(std::min(delta, clock_.longest_delta) / clock_.median_gap);
+          age_[c] = T(std::min(delta, clock_.longest_delta) / clock_.age_unit);
       }
     }
     if (clock_.exponential)
       start_[0] = T(elapsed_before / clock_.unit), end_[0] = T(elapsed / clock_.unit);
-    if (clock_.age == AGE_ELAPSED) age_[0] = T(elapsed / clock_.median_gap);
-    if (clock_.age == AGE_GAP) age_[0] = T((time - before) / clock_.median_gap);
+    if (clock_.age == AGE_ELAPSED) age_[0] = T(elapsed / clock_.age_unit);
+    if (clock_.age == AGE_GAP) age_[0] = T((time - before) / clock_.age_unit);
 
     StreamRow<T> row;
     row.spec = &spec_;
@@ -205,11 +205,11 @@ void bind_live(nb::module_& m, const std::string& suffix) {
           "__init__",
           [](Live<T>* self, const Spec& spec, const std::string& body, Const<T> weights,
              Const<T> mean, Const<T> std, const std::vector<int>& decoder,
-             Maybe<T> decoder_weights, Const<T> first_state, double unit, double median_gap,
+             Maybe<T> decoder_weights, Const<T> first_state, double unit, double age_unit,
              double elapsed_limit, double longest_delta, int age, bool from_first_row,
              bool last_row, bool every_row, bool starts_only, bool exponential) {
             Clockwork c;
-            c.unit = unit, c.median_gap = median_gap, c.elapsed_limit = elapsed_limit;
+            c.unit = unit, c.age_unit = age_unit, c.elapsed_limit = elapsed_limit;
             c.longest_delta = longest_delta, c.age = age, c.from_first_row = from_first_row;
             c.last_row = last_row, c.every_row = every_row, c.starts_only = starts_only;
             c.exponential = exponential;
@@ -219,7 +219,7 @@ void bind_live(nb::module_& m, const std::string& suffix) {
           nb::arg("spec"), nb::arg("body"), nb::arg("weights").noconvert(),
           nb::arg("mean").noconvert(), nb::arg("std").noconvert(), nb::arg("decoder"),
           nb::arg("decoder_weights").noconvert().none(), nb::arg("first_state").noconvert(),
-          nb::arg("unit"), nb::arg("median_gap"), nb::arg("elapsed_limit"),
+          nb::arg("unit"), nb::arg("age_unit"), nb::arg("elapsed_limit"),
           nb::arg("longest_delta"), nb::arg("age"), nb::arg("from_first_row"),
           nb::arg("last_row"), nb::arg("every_row"), nb::arg("starts_only"),
           nb::arg("exponential"))

@@ -14,6 +14,8 @@ LABELS = (
     "gru_fair",
     "gru_d_fair",
     "anchored_ode_gru_d",
+    "gru_unfed",
+    "gru_d_unfed",
 )
 FRACTIONS = (0.9, 0.7, 0.5, 0.3)
 HONEST = {
@@ -24,6 +26,8 @@ HONEST = {
     "gru_fair": 0.00090,
     "gru_d_fair": 0.00092,
     "anchored_ode_gru_d": 0.00036,
+    "gru_unfed": 0.00094,
+    "gru_d_unfed": 0.00088,
 }
 """Honest MSE at 30 %; it falls in proportion to the hidden share."""
 HALVING = {"gru": 40, "gru_d": 36, "ode_rnn": 30, "ode_gru_d": 12}

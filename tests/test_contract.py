@@ -52,7 +52,7 @@ def option_sets(name: str) -> dict[str, dict[str, Any]]:
     entry = resolve(ModelConfig(name=name))
     sets: dict[str, dict[str, Any]] = {"": {}, "first_row": {"clock": "first_row"}}
     if entry.cell != "none":
-        sets["every"] = {"update_rows": "every", "age_input": "delta"}
+        sets["every"] = {"update_rows": "every", "age_input": "delta", "age_unit": "longest"}
         if not entry.anchored:
             sets["self_feeding"] = {"self_feeding": 0.5}
     if entry.cell == "gru":

@@ -239,11 +239,15 @@ def gru_in_floats(model: RecurrentModel, h: list[float], x: list[float]) -> list
 
 
 @pytest.mark.parametrize("age_input", ["none", "elapsed", "gap", "delta"])
+@pytest.mark.parametrize("age_unit", ["gap", "longest"])
 @pytest.mark.parametrize("update_rows", ["observed", "every"])
-def test_gru_is_equations_20_to_23_in_plain_floats(age_input: str, update_rows: str) -> None:
+def test_gru_is_equations_20_to_23_in_plain_floats(
+    age_input: str, age_unit: str, update_rows: str
+) -> None:
     data = sample()
-    model = small_model("gru", age_input=age_input, update_rows=update_rows)
-    unit = median_gap(model)
+    model = small_model("gru", age_input=age_input, age_unit=age_unit, update_rows=update_rows)
+    unit = median_gap(model) if age_unit == "gap" else model.statistics.longest_delta
+    assert model.statistics.longest_delta > median_gap(model)
     h, after = [0.0] * model.hidden_size, []
     before = latest = 0.0
     delta = [0.0] * 3

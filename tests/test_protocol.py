@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import offbeat as ob
-from offbeat.experiment.protocol import MODELS, THESIS_ROWS, Protocol, select
+from offbeat.experiment.protocol import CONTROLS, MODELS, THESIS_ROWS, Protocol, select
 from offbeat.models.zoo import resolve
 
 FULL = Protocol()
 
 
-def test_the_protocol_has_the_176_runs_of_the_thesis_and_120_of_ours():
+def test_the_protocol_has_the_176_runs_of_the_thesis_120_of_ours_and_then_80_controls():
     runs = FULL.runs()
     thesis = [run for run in runs if run.model in THESIS_ROWS]
     assert Counter(run.experiment for run in thesis) == {1: 16, 2: 160}
@@ -22,9 +22,12 @@ def test_the_protocol_has_the_176_runs_of_the_thesis_and_120_of_ours():
         "gru_fair": 40,
         "gru_d_fair": 40,
         "anchored_ode_gru_d": 40,
+        "gru_unfed": 40,
+        "gru_d_unfed": 40,
     }
-    assert len({run.run_id for run in runs}) == len(runs) == 296
-    assert len({run.seed_weights for run in runs}) == 296
+    assert len({run.run_id for run in runs}) == len(runs) == 376
+    assert len({run.seed_weights for run in runs}) == 376
+    assert all(run.model in CONTROLS for run in runs[296:])
 
 
 def test_the_thesis_is_1_9_million_training_steps():
@@ -49,8 +52,10 @@ def test_the_models_of_a_repeat_share_the_seed_of_all_draws_and_nothing_else_doe
 
 def test_any_beginning_of_the_runs_has_done_all_models_and_fractions_equally_often():
     done: Counter[tuple[str, float]] = Counter()
-    cells = [(model, p) for model in MODELS for p in FULL.observed_fractions]
-    for run in FULL.runs():
+    cells = [
+        (model, p) for model in MODELS if model not in CONTROLS for p in FULL.observed_fractions
+    ]
+    for run in FULL.runs()[:296]:
         if run.experiment == 2:
             done[run.model, run.observed_fraction] += 1
             counts = [done[cell] for cell in cells]
@@ -68,9 +73,18 @@ def test_a_row_of_the_thesis_is_the_zoo_s_model_under_the_thesis_protocol(label)
 def test_the_fair_models_see_what_the_ode_models_see():
     gru, gru_d = (resolve(FULL.model_config(label)) for label in ("gru_fair", "gru_d_fair"))
     fair = {"self_feeding": 0.0, "update_rows": "every", "decay_rows": "every_row"}
-    expected = resolve(ob.thesis_config("gru", age_input="delta", **fair))
+    expected = resolve(ob.thesis_config("gru", age_input="delta", age_unit="longest", **fair))
     assert gru == expected
     assert gru_d == resolve(ob.thesis_config("gru_d", **fair))
+
+
+@pytest.mark.parametrize("label", CONTROLS)
+def test_a_control_differs_from_the_row_of_the_thesis_in_self_feeding_alone(label):
+    row = asdict(resolve(FULL.model_config(label.removesuffix("_unfed"))))
+    control = asdict(resolve(FULL.model_config(label)))
+    assert {n: (row[n], control[n]) for n in row if row[n] != control[n]} == {
+        "self_feeding": (0.5, 0.0)
+    }
 
 
 def test_the_anchored_model_is_the_zoo_s_with_its_own_training():
@@ -151,7 +165,7 @@ def test_a_filter_joins_values_of_a_key_by_or_and_keys_by_and():
     chosen = select(FULL.runs(), "experiment=1,model=ode_rnn,model=gru, fraction=0.3")
     assert [run.run_id for run in chosen] == ["e1-gru-30-r00", "e1-ode_rnn-30-r00"]
     assert select(FULL.runs(), None) == FULL.runs()
-    assert len(select(FULL.runs(), "repeat=9")) == 28
+    assert len(select(FULL.runs(), "repeat=9")) == 36
 
 
 @pytest.mark.parametrize(
@@ -161,7 +175,7 @@ def test_a_filter_joins_values_of_a_key_by_or_and_keys_by_and():
         ("model=gru_faire", "did you mean 'gru_fair'"),
         ("experiment", "expected key=value"),
         ("experiment=one", "must be a number"),
-        ("experiment=1,model=gru_fair", "leaves none of the 296 runs"),
+        ("experiment=1,model=gru_fair", "leaves none of the 376 runs"),
     ],
 )
 def test_a_filter_that_is_not_understood_says_what_is(only, said):

@@ -211,4 +211,6 @@ def test_every_conclusion_of_the_thesis_gets_a_finding(record):
         "Fair GRU",
         "Fair GRU-D",
         "Anchored ODE-GRU-D",
+        "GRU, not self-fed",
+        "GRU-D, not self-fed",
     }

@@ -140,7 +140,7 @@ def test_what_is_missing_and_what_is_mixed_is_told_on_the_page_and_by_the_result
     said = " ".join(report.messages)
     for words in (
         "Another> & one: 1",
-        "64 of 296 runs are there: 8 of 16 of experiment 1 and 56 of 280 of experiment 2",
+        "80 of 376 runs are there: 8 of 16 of experiment 1 and 72 of 360 of experiment 2",
         "Figures 3.4, 3.5 each need a run of experiment 1",
         "Figures 3.8, 3.9 each need a run of experiment 2",
     ):
@@ -148,7 +148,7 @@ def test_what_is_missing_and_what_is_mixed_is_told_on_the_page_and_by_the_result
     text = report.page.read_text(encoding="utf-8")
     assert "&lt;Another&gt; &amp; one: 1" in text
     assert "4 of 10" in text
-    assert "64 of 296 runs" in text  # 2 shares x (4 + 7 x 4)
+    assert "80 of 376 runs" in text  # 2 shares x (4 + 9 x 4)
     assert "<sup>†</sup>" in text
     assert report.to_dict()["messages"] == list(report.messages)
 

@@ -45,6 +45,9 @@ class ModelConfig:
         update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
         age_input: what tells a plain cell how old its knowledge is: `elapsed` since the last
             observed row, `delta` per channel (equation 25), `gap` since the row before, or `none`.
+        age_unit: of that age: the median `gap` of training, or the `longest` age met there, so
+            that it is at most 1 in training. Ages of many gaps drown the values beside them, and
+            training takes longer.
         self_feeding: share of rows at which the cell's input is the model's own decoded
             prediction in place of the observed values (one coin per row for the whole batch,
             row 0 excepted), in training and in testing. A fault of public code, kept by name.
@@ -80,6 +83,7 @@ class ModelConfig:
     anchored: bool | None = None
     update_rows: Literal["observed", "every"] | None = None
     age_input: Literal["none", "elapsed", "delta", "gap"] | None = None
+    age_unit: Literal["gap", "longest"] | None = None
     self_feeding: float | None = None
     readout: Literal["target", "last_row"] | None = None
     init: Literal["normal", "fan_in"] | None = None
@@ -129,6 +133,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "decay_rows": ("continuous", "every_row", "observed_rows"),
     "update_rows": ("observed", "every"),
     "age_input": ("none", "elapsed", "delta", "gap"),
+    "age_unit": ("gap", "longest"),
     "readout": ("target", "last_row"),
     "init": ("normal", "fan_in"),
     "clock": ("first_observation", "first_row"),

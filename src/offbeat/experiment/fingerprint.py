@@ -15,7 +15,7 @@ import numpy as np
 from offbeat.data.prepare import Scaler
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.evaluation import evaluate
-from offbeat.experiment.protocol import MODELS, Protocol, Run
+from offbeat.experiment.protocol import CONTROLS, MODELS, Protocol, Run
 from offbeat.models.zoo import make
 from offbeat.scores import SCORINGS
 from offbeat.training import fit
@@ -44,12 +44,20 @@ def fingerprint(protocol: Protocol | None = None) -> str:
     Args:
         protocol: by default the thesis'.
     """
-    protocol = protocol or Protocol()
+    whole = "".join(fingerprints(protocol or Protocol()).values())
+    return hashlib.sha256(whole.encode()).hexdigest()[:12]
+
+
+def fingerprints(protocol: Protocol) -> dict[str, str]:
+    """The hash of each model by its label; `fingerprint` is the hash of them all.
+
+    The controls are left out: they consist of nothing that the others do not meet.
+    """
     recorded = walks()
     scaler = Scaler.fit(protocol.scaler, recorded)
-    digest = hashlib.sha256()
-    parts = None
-    for label in MODELS:
+    found, parts = dict[str, str](), None
+    for label in [label for label in MODELS if label not in CONTROLS]:
+        digest = hashlib.sha256()
         run = Run(2, label, _FRACTION, 0, _EPOCHS, seed_draw=1, seed_weights=2)
         parts = parts or protocol.cut(recorded, run)
         train, validation, test = parts
@@ -62,4 +70,5 @@ def fingerprint(protocol: Protocol | None = None) -> str:
             digest.update(
                 repr([(name, getattr(scores[who], name).mse) for name in SCORINGS]).encode()
             )
-    return digest.hexdigest()[:12]
+        found[label] = digest.hexdigest()[:12]
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 from offbeat.config import ModelConfig, TrainConfig
@@ -24,10 +24,14 @@ MODELS: dict[str, str] = {
     "gru_fair": "gru",
     "gru_d_fair": "gru_d",
     "anchored_ode_gru_d": "anchored_ode_gru_d",
+    "gru_unfed": "gru",
+    "gru_d_unfed": "gru_d",
 }
 """Labels of the record, each with its entry in the zoo. The first four are the thesis' rows."""
 
 THESIS_ROWS = tuple(MODELS)[:4]
+CONTROLS = ("gru_unfed", "gru_d_unfed")
+"""GRU and GRU-D of the thesis' rows but for self-feeding: they show what it does by itself."""
 
 
 @dataclass(frozen=True)
@@ -165,22 +169,25 @@ class Protocol:
         """All runs, in an order in which a part of them is useful.
 
         Experiment 2 goes repeat by repeat, and in a repeat fraction by fraction, each over all
-        seven models, so that what is done is always paired. The four models of experiment 1 at one
-        fraction follow each of the first repeats.
+        models but the controls, so that what is done is always paired. The four models of
+        experiment 1 at one fraction follow each of the first repeats. The controls come last.
         """
-        runs: list[Run] = []
+        runs, controls = list[Run](), list[Run]()
         for i in range(max(self.repeats, len(self.observed_fractions))):
             if i < self.repeats:
                 for fraction, epochs in zip(
                     self.observed_fractions, self.epochs_of_repeats, strict=True
                 ):
-                    runs += [self._run(2, model, fraction, i, epochs) for model in MODELS]
+                    for model in MODELS:
+                        (controls if model in CONTROLS else runs).append(
+                            self._run(2, model, fraction, i, epochs)
+                        )
             if i < len(self.observed_fractions):
                 fraction = self.observed_fractions[i]
                 runs += [
                     self._run(1, model, fraction, 0, self.epochs_of_curves) for model in THESIS_ROWS
                 ]
-        return tuple(runs)
+        return (*runs, *controls)
 
     def _run(self, experiment: int, model: str, fraction: float, repeat: int, epochs: int) -> Run:
         draw = 100_000 * experiment + 1000 * round(100 * fraction) + repeat
@@ -226,7 +233,8 @@ class Protocol:
 
         The two fair models keep the thesis' readout and clock. Without self-feeding they see what
         the ODE models see; both update at every row, and GRU is given the age of each channel
-        (equation 25), so that it knows how old its last observation is.
+        (equation 25), so that it knows how old its last observation is. The controls are the rows
+        of the thesis without self-feeding, and differ from them in nothing else.
 
         Args:
             label: one of `MODELS`.
@@ -234,6 +242,8 @@ class Protocol:
         from offbeat.models.zoo import thesis_config
 
         one_of("model of the protocol", label, MODELS)
+        if label in CONTROLS:
+            return replace(self.model_config(MODELS[label]), self_feeding=0.0)
         if label == "anchored_ode_gru_d":
             return ModelConfig(
                 name=label,
@@ -257,7 +267,7 @@ class Protocol:
         if label.endswith("_fair"):
             options["update_rows"] = "every"
         if label == "gru_fair":
-            options["age_input"] = "delta"
+            options |= {"age_input": "delta", "age_unit": "longest"}
         return thesis_config(MODELS[label], **options)
 
     def train_config(self, run: Run) -> TrainConfig:

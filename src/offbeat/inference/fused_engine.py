@@ -47,7 +47,7 @@ class FusedEngine(Engine):
                 decoder_weights=decoder_weights,
                 first_state=model.first_state(1)[0].detach().contiguous().numpy(),
                 unit=model.time_unit,
-                median_gap=statistics.median_gap,
+                age_unit=model.age_unit,
                 elapsed_limit=statistics.longest_elapsed * limit,
                 longest_delta=statistics.longest_delta * limit,
                 age=_AGES[config.age_input or "none"],

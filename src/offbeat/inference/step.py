@@ -39,7 +39,7 @@ class StreamStep(nn.Module):
     shift: Tensor
     scale: Tensor
     unit: Tensor
-    median_gap: Tensor
+    age_unit: Tensor
     elapsed_limit: Tensor
     delta_limit: Tensor
 
@@ -53,7 +53,7 @@ class StreamStep(nn.Module):
         statistics, limit = model.statistics, float(model.config.gap_limit or 1)
         for name, number in (
             ("unit", model.time_unit),
-            ("median_gap", statistics.median_gap),
+            ("age_unit", model.age_unit),
             ("elapsed_limit", statistics.longest_elapsed * limit),
             ("delta_limit", statistics.longest_delta * limit),
         ):
@@ -120,10 +120,10 @@ class StreamStep(nn.Module):
         context = [shown, mask.to(dtype)]
         if config.age_input == "delta":
             age = torch.minimum(delta, self.delta_limit)
-            context.append((age / self.median_gap).to(dtype))
+            context.append((age / self.age_unit).to(dtype))
         elif config.age_input in ("elapsed", "gap"):
             age = elapsed if config.age_input == "elapsed" else t - before
-            context.append((age / self.median_gap).to(dtype)[:, None])
+            context.append((age / self.age_unit).to(dtype)[:, None])
         gates = linear(torch.cat(context, dim=1), model.cell.inputs, model.cell.bias)
         after = self._updated(carried, gates, update.to(dtype)[:, None], shown, mask.to(dtype))
         return (

@@ -73,6 +73,8 @@ class RecurrentModel(nn.Module):
         self.config, self.statistics, self.scaler = config, statistics, scaler
         self.names, self.units = names, units
         self.time_unit = statistics.median_gap / float(config.typical_gap or 1)
+        longest = config.age_unit == "longest"
+        self.age_unit = statistics.longest_delta if longest else statistics.median_gap
         channels, hidden = statistics.channels, int(config.hidden_size or 1)
         self.channels, self.hidden_size = channels, hidden
         self.mean: Tensor
@@ -303,13 +305,13 @@ class RecurrentModel(nn.Module):
 
     def _age(self, at_rows: Ages) -> Tensor | None:
         """(batch, rows, ages) what tells a plain cell how old its knowledge is."""
-        name, median = self.config.age_input, self.statistics.median_gap
+        name, unit = self.config.age_input, self.age_unit
         if name == "delta":
             longest = self.statistics.longest_delta * float(self.config.gap_limit or 1)
-            return (at_rows.delta.clamp_max(longest) / median).to(self.dtype)
+            return (at_rows.delta.clamp_max(longest) / unit).to(self.dtype)
         if name in ("elapsed", "gap"):
             age = at_rows.elapsed if name == "elapsed" else at_rows.step
-            return (age / median).to(self.dtype)[..., None]
+            return (age / unit).to(self.dtype)[..., None]
         return None
 
 

@@ -32,6 +32,7 @@ _COMMON: dict[str, Any] = {
     "anchored": False,
     "update_rows": "observed",
     "age_input": "none",
+    "age_unit": "gap",
     "self_feeding": 0.0,
     "readout": "target",
     "init": "normal",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-BEYOND = ("gru_fair", "gru_d_fair", "anchored_ode_gru_d")
+BEYOND = ("gru_unfed", "gru_d_unfed", "gru_fair", "gru_d_fair", "anchored_ode_gru_d")
 """Models of experiment 2 that the thesis does not have."""
 
 

@@ -26,9 +26,11 @@ from offbeat.report.tables import LAST_VALUE, label
 
 PLAIN = ("gru", "gru_d")
 FAIR = ("gru_fair", "gru_d_fair")
+CONTROLS = ("gru_unfed", "gru_d_unfed")
 ODE = ("ode_rnn", "ode_gru_d")
 ANCHORED = "anchored_ode_gru_d"
-MODELS = (*thesis.MODELS, *FAIR, ANCHORED)
+RANKED = (*thesis.MODELS, *FAIR, ANCHORED)
+MODELS = (*RANKED, *CONTROLS)
 """Models of experiment 2, in the order of tables and figures."""
 
 OURS = (("ode_gru_d", "ode_rnn"),)
@@ -37,10 +39,12 @@ OURS = (("ode_gru_d", "ode_rnn"),)
 FAMILIES: dict[str, tuple[tuple[str, str], ...]] = {
     "ode_models": OURS,
     "against_plain": tuple((a, b) for a in ODE for b in PLAIN),
-    "against_fair": tuple((a, b) for a in ODE for b in FAIR),
-    "self_feeding": (("gru_fair", "gru"), ("gru_d_fair", "gru_d")),
+    "against_fair": tuple((a, b) for a in ODE for b in (*CONTROLS, *FAIR)),
+    "self_feeding": tuple(
+        pair for them in (CONTROLS, FAIR) for pair in zip(them, PLAIN, strict=True)
+    ),
     "plain": (("gru_d", "gru"),),
-    "anchored": tuple((ANCHORED, b) for b in (*ODE, *FAIR)),
+    "anchored": tuple((ANCHORED, b) for b in (*ODE, *CONTROLS, *FAIR)),
     "last_value": tuple((m, LAST_VALUE) for m in MODELS),
 }
 """Pairs that are corrected together, over all observed shares of a scoring."""
@@ -194,7 +198,7 @@ def thesis_rule(
 
 
 def ranks(
-    record: Record, scoring: str, *, models: Sequence[str] = MODELS
+    record: Record, scoring: str, *, models: Sequence[str] = RANKED
 ) -> dict[float, FriedmanResult | str]:
     """Friedman's test over the repeats at each observed share; a reason where there is none.
 

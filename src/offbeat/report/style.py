@@ -49,10 +49,12 @@ STYLES: dict[str, Style] = {
     "neural_ode": Style("Neural ODE", "#882255", "*", _DASHED),
     "gru_fair": Style("Fair GRU", "#CC79A7", "o", _DOTTED),
     "gru_d_fair": Style("Fair GRU-D", "#999933", "s", _DASH_DOT),
+    "gru_unfed": Style("GRU, not self-fed", "#44AA99", "o", _DOTTED),
+    "gru_d_unfed": Style("GRU-D, not self-fed", "#CC6677", "s", _DASH_DOT),
 }
 """The styles by id of the model; `truth` and `last_value` stand beside them."""
 
-_OTHERS = ("#44AA99", "#CC6677", "#117733", "#661100", "#6699CC")
+_OTHERS = ("#117733", "#661100", "#6699CC")
 
 
 def style_of(name: str) -> Style:

@@ -41,8 +41,9 @@ def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
         notes(
             record,
             blocks,
-            "Bold: the lowest of its column within a block, where all are there. Fair: without "
-            "self-feeding, updated at every row, GRU with the age of each channel as input.",
+            "Bold: the lowest of its column within a block, where all are there. Not self-fed: "
+            "the thesis' rows without self-feeding. Fair: not self-fed either, updated at every "
+            "row, GRU with the age of each channel as input.",
             missing_runs(record, 2, MODELS, repeats),
         ),
     )

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from offbeat.errors import InputError
 from offbeat.report import thesis_numbers as thesis
-from offbeat.report.pairing import FAIR, Pair, Rule
+from offbeat.report.pairing import CONTROLS, FAIR, Pair, Rule
 from offbeat.report.records import Record
 from offbeat.report.statistics import FriedmanResult, shapiro_wilk
 from offbeat.report.table import MINUS, MIXED, Block, Cell, Table
@@ -21,8 +21,8 @@ SCORING_NAMES = {
 _COLUMNS = tuple(map(percent, thesis.FRACTIONS))
 _SIGNIFICANT = f"Bold: below the level of significance, {thesis.ALPHA:g}."
 _FAIR = (
-    "The fair models differ from the thesis' rows in more than self-feeding: they also update at "
-    "every row, and GRU is given the age of each channel."
+    "Not self-fed: the thesis' rows without self-feeding, and nothing else changed. Fair: not "
+    "self-fed either; they also update at every row, and GRU is given the age of each channel."
 )
 _CAVEAT = (
     "The rule takes the two samples to be independent. The runs share windows and masks within a "
@@ -235,7 +235,7 @@ def family_table(
             f"In brackets p of the paired t test, corrected by Holm within a block. Bold: p ≤ "
             f"{thesis.ALPHA:g}. Negative: the first is better.",
             _FAIR
-            if all(p.a in FAIR or p.b in FAIR for ps in families.values() for p in ps)
+            if all({p.a, p.b} & {*CONTROLS, *FAIR} for ps in families.values() for p in ps)
             else "",
             f"Pairs without a number lack runs ({len(missing)})." if missing else "",
         ),
