@@ -32,8 +32,8 @@ _INFERRED = (
     "That its GRU and GRU-D were fed their own predictions at half of the rows "
     "(`self_feeding=0.5`): a public code base of that time does so with plain recurrent models "
     "and not with ODE models; how near the thesis' rows come out with it is table A.1.",
-    "Which constant its own draw of initial states had: table A.1 gives the one that each cell would "
-    "need; what other draws have is measured in `docs/reproduce.md`.",
+    "Which constant its own draw of initial states had: table A.1 gives the one that each cell "
+    "would need; what other draws have is measured in `docs/reproduce.md`.",
     "Everything else that its text leaves open is settled in `docs/deviations.md`.",
 )
 
