@@ -31,7 +31,8 @@ _INFERRED = (
     "spread more than the 0.0004 that the thesis prints for ODE-GRU-D at 70, 50 and 30 %.",
     "That its GRU and GRU-D were fed their own predictions at half of the rows "
     "(`self_feeding=0.5`): a public code base of that time does so with plain recurrent models "
-    "and not with ODE models; how near the thesis' rows come out with it is table A.1.",
+    "and not with ODE models; how near the thesis' rows come out with it is table A.1, and that "
+    "its coins alone spread scores as the thesis' repeats do is measured in `docs/reproduce.md`.",
     "Which constant its own draw of initial states had: table A.1 gives the one that each cell "
     "would need; what other draws have is measured in `docs/reproduce.md`.",
     "Everything else that its text leaves open is settled in `docs/deviations.md`.",

@@ -1,0 +1,57 @@
+"""How far the scores of a self-fed model move with its coins alone: same weights, same test part.
+
+    offbeat reproduce --out runs/thesis --only experiment=1,model=gru,fraction=0.3
+    python benchmarks/coins.py runs/thesis e1-gru-30-r00 --out results/benchmarks/coins.json
+
+Self-feeding draws one coin per row for the whole part that is scored, so a score is of one sequence
+of 100 coins, however many trajectories there are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from common import machine, write
+
+import offbeat as ob
+from offbeat.experiment.protocol import Protocol
+
+
+def main() -> None:
+    """Scores the run's model with coins of many seeds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="of a reproduction, with its checkpoints")
+    parser.add_argument("run_id")
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/coins.json"))
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+
+    protocol = Protocol()
+    (run,) = (run for run in protocol.runs() if run.run_id == arguments.run_id)
+    _, _, test = protocol.cut(ob.load(arguments.folder / "data" / "recorded.parquet"), run)
+    model = ob.load_checkpoint(arguments.folder / "runs" / run.run_id / "training" / "model")
+    scores = [
+        ob.evaluate({"m": model}, test, seed=seed).scores["m"] for seed in range(arguments.seeds)
+    ]
+    found = {
+        name: [getattr(score, name).rmse for score in scores] for name in ("published", "honest")
+    }
+    kept = {}
+    if arguments.out.exists():
+        kept = json.loads(arguments.out.read_text(encoding="utf-8"))["runs"]
+    write(str(arguments.out), {"machine": machine(), "runs": {**kept, run.run_id: found}})
+    for name, values in found.items():
+        print(
+            f"{run.run_id}  {name} RMSE, coins of {len(values)} seeds: mean {np.mean(values):.4f}"
+            f"  std {np.std(values, ddof=1):.4f}  from {min(values):.4f} to {max(values):.4f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
