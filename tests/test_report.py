@@ -49,7 +49,7 @@ def test_every_model_of_the_zoo_has_a_style_of_its_own():
 
 def test_a_name_without_a_style_gets_the_same_one_in_every_process():
     assert style_of("my_run") == style_of("my_run")
-    assert (style_of("my_run").label, style_of("my_run").colour) == ("my_run", "#44AA99")
+    assert (style_of("my_run").label, style_of("my_run").colour) == ("my_run", "#117733")
 
 
 # --- figures --------------------------------------------------------------------------------------
