@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import offbeat
+from offbeat.commands.report import _illustrated
 from offbeat.data.thin import thin
 from offbeat.errors import FileFormatError, InputError, MissingExtraError
 from offbeat.experiment import illustrate as module
@@ -204,3 +205,21 @@ def test_stills_show_the_robot_of_each_row(data):
     assert pictures.shape[0] == 3
     np.testing.assert_array_equal(pictures[0], pictures[1])
     assert (pictures[0] != pictures[2]).any()
+
+
+def test_a_report_keeps_illustrations_that_show_every_model_it_has_and_more(tmp_path, monkeypatch):
+    def begin(run):
+        folder = tmp_path / "models" / run
+        folder.mkdir(parents=True)
+        (folder / "config.json").touch()
+
+    runs = {"gru": "e1-gru-30-r00", "ode_rnn": "e1-ode_rnn-30-r00"}
+    recordings = np.zeros((1, 2, 1))
+    kept = Illustrations("hopper", ("a",), ("m",), np.arange(2.0), recordings, 0.3, runs)
+    remade = Illustrations("hopper", ("a",), ("m",), np.arange(2.0), recordings)
+    monkeypatch.setattr(module, "illustrate", lambda found, observed_fraction: remade)
+    begin("e1-ode_rnn-30-r00")
+    assert _illustrated(tmp_path, tmp_path / "out", 0.3, kept) is kept
+    assert _illustrated(tmp_path, tmp_path / "out", 0.3, None) is remade
+    begin("e1-ode_gru_d-30-r00")
+    assert _illustrated(tmp_path, tmp_path / "out", 0.3, kept) is remade

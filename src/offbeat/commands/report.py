@@ -58,8 +58,8 @@ def _illustrated(
     from offbeat.experiment.illustrate import checkpoints_of, illustrate, runs_of
 
     found = checkpoints_of(runs, fraction)
-    if shown is not None and (not found or shown.runs == runs_of(found)):
-        return shown
+    if shown is not None and runs_of(found).items() <= shown.runs.items():
+        return shown  # of these models, and maybe of others whose checkpoints are elsewhere
     try:
         made = illustrate(found, observed_fraction=fraction)
     except MissingExtraError as error:
