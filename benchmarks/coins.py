@@ -10,12 +10,11 @@ of 100 coins, however many trajectories there are.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 import torch
-from common import machine, write
+from common import kept, machine, write
 
 import offbeat as ob
 from offbeat.experiment.protocol import Protocol
@@ -42,15 +41,17 @@ def main() -> None:
     found = {
         name: [getattr(score, name).rmse for score in scores] for name in ("published", "honest")
     }
-    kept = {}
-    if arguments.out.exists():
-        kept = json.loads(arguments.out.read_text(encoding="utf-8"))["runs"]
-    write(str(arguments.out), {"machine": machine(), "runs": {**kept, run.run_id: found}})
+    runs = {**(kept(arguments.out, "runs") or {}), run.run_id: found}
+    write(str(arguments.out), {"machine": machine(), "runs": runs})
     for name, values in found.items():
         print(
             f"{run.run_id}  {name} RMSE, coins of {len(values)} seeds: mean {np.mean(values):.4f}"
             f"  std {np.std(values, ddof=1):.4f}  from {min(values):.4f} to {max(values):.4f}"
         )
+        for other in runs:
+            if other != run.run_id and len(runs[other][name]) == len(values):
+                together = np.corrcoef(values, runs[other][name])[0, 1]
+                print(f"  correlation with {other} over the seeds: {together:.4f}")
 
 
 if __name__ == "__main__":

@@ -51,6 +51,11 @@ def machine() -> dict[str, Any]:
     return found
 
 
+def kept(path: Path, name: str) -> Any:
+    """What an earlier call left under a name of its result, or None."""
+    return json.loads(path.read_text(encoding="utf-8"))[name] if path.exists() else None
+
+
 def write(path: str | None, result: dict[str, Any]) -> None:
     """Writes a result as JSON, where a path is given."""
     if path is None:

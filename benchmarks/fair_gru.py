@@ -12,14 +12,13 @@ already is not trained again.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from common import machine, write
+from common import kept, machine, write
 
 import offbeat as ob
 from offbeat.evaluation import LAST_VALUE
@@ -80,20 +79,18 @@ def main() -> None:
         if (run.experiment, run.model, run.observed_fraction, run.repeat) == asked
     )
     key = {"fraction": arguments.fraction, "repeat": arguments.repeat}
-    kept: list[dict[str, Any]] = []
-    if arguments.out.exists():
-        kept = json.loads(arguments.out.read_text(encoding="utf-8"))["runs"]
+    done: list[dict[str, Any]] = kept(arguments.out, "runs") or []
     todo = [
-        variant for variant in VARIANTS if not any({**row, **key, **variant} == row for row in kept)
+        variant for variant in VARIANTS if not any({**row, **key, **variant} == row for row in done)
     ]
     if todo:
         recorded = protocol.simulate(progress=False)
         scaler = ob.Scaler.fit(protocol.scaler, recorded)
         parts = protocol.cut(recorded, run)
     for variant in todo:
-        kept.append({**key, **trained(protocol, parts, scaler, run, variant)})
-        write(str(arguments.out), {"machine": machine(), "runs": kept})
-    for row in kept:
+        done.append({**key, **trained(protocol, parts, scaler, run, variant)})
+        write(str(arguments.out), {"machine": machine(), "runs": done})
+    for row in done:
         print(
             f"{row['fraction']:.0%} repeat {row['repeat']}  update {row['update_rows']:8}"
             f"  age {row['age_input']:8} in {row['age_unit']:8}"

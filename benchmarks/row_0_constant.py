@@ -11,13 +11,12 @@ The first draw is the protocol's own.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import machine, write
+from common import kept, machine, write
 
 import offbeat as ob
 from offbeat.evaluation import LAST_VALUE
@@ -51,14 +50,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks/row_0_constant.json"))
     arguments = parser.parse_args()
     protocol = Protocol()
-    kept: list[dict[str, Any]] = []
-    if arguments.out.exists():
-        kept = json.loads(arguments.out.read_text(encoding="utf-8"))["draws"]
+    done: list[dict[str, Any]] = kept(arguments.out, "draws") or []
     for seed in (protocol.state_seed, *range(arguments.draws - 1)):
-        if all(draw["state_seed"] != seed for draw in kept):
-            kept.append(measured(replace(protocol, state_seed=seed)))
-            write(str(arguments.out), {"machine": machine(), "draws": kept})
-    for draw in kept:
+        if all(draw["state_seed"] != seed for draw in done):
+            done.append(measured(replace(protocol, state_seed=seed)))
+            write(str(arguments.out), {"machine": machine(), "draws": done})
+    for draw in done:
         shown = "  ".join(
             f"{float(p):.0%} {scores['published']:.4f} ({scores['honest']:.4f})"
             for p, scores in draw["last_value"].items()

@@ -441,13 +441,13 @@ def test_what_is_published_can_be_gone_on_from_and_keeps_what_stands_there(done,
     assert kept == ["e1-ode_gru_d-50-r00", "e1-ode_rnn-50-r00"]
     other = tmp_path / "other"
     reproduce(SMALL, other, record=to, progress=False)
-    publish(other, to, SMALL, command=["offbeat", "reproduce"])
+    publish(other, to, SMALL, command=["offbeat", "reproduce", "--budget_minutes", "5"])
     assert numbers(Record.read(to)) == numbers(Record.read(done))
     assert sorted(path.name for path in (to / "models").iterdir()) == kept
     about = json.loads((to / "about.json").read_text(encoding="utf-8"))
     assert about["runs_done"] == about["runs_total"] == len(SMALL.runs())
     assert len(about["sittings"]) == 2
-    assert about["commands"] == [["offbeat", "reproduce"]]
+    assert about["commands"] == [["offbeat", "reproduce"]]  # a time limit changes no number
     assert sum(group["runs"] for group in about["made_by"]) == len(SMALL.runs())
     assert ob.load_checkpoint(to / "models" / kept[0]).config.name == "ode_gru_d"
 

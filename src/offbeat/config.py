@@ -46,8 +46,8 @@ class ModelConfig:
         age_input: what tells a plain cell how old its knowledge is: `elapsed` since the last
             observed row, `delta` per channel (equation 25), `gap` since the row before, or `none`.
         age_unit: of that age: the median `gap` of training, or the `longest` age met there, so
-            that it is at most 1 in training. Ages of many gaps drown the values beside them, and
-            training takes longer.
+            that it is at most 1 in training. Ages that count many gaps are large beside the values,
+            and can take longer to learn from.
         self_feeding: share of rows at which the cell's input is the model's own decoded
             prediction in place of the observed values (one coin per row for the whole batch,
             row 0 excepted), in training and in testing. A fault of public code, kept by name.

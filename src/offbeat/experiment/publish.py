@@ -39,7 +39,7 @@ def publish(
             time, machine, versions, command, and how many runs were made by what), and under
             `models/` the weights of ODE-RNN and ODE-GRU-D in experiment 1.
         protocol: of the experiment.
-        command: what was typed.
+        command: what was typed; it is kept without its time limit.
     """
     out, to = Path(out), Path(to)
     record = Record.read(out)
@@ -64,11 +64,10 @@ def _about(
     # Two short ones may begin within one second.
     sittings = {(line["began_at"], line["seconds"]): line for line in lines}
     ordered = [sittings[began] for began in sorted(sittings)]
-    commands = list(before.get("commands", []))
-    if command and list(command) not in commands:
-        commands.append(list(command))
+    typed = [*before.get("commands", []), list(command)]
+    commands = [line for line in map(_without_budget, typed) if line]
     return {
-        "commands": commands,
+        "commands": [line for i, line in enumerate(commands) if line not in commands[:i]],
         "runs_done": len(record.runs),
         "runs_total": len(protocol.runs()),
         "seconds_of_runs": sum(row["seconds"] for row in record.runs.values()),
@@ -87,6 +86,17 @@ def _about(
         "sittings": ordered,
         "protocol": asdict(protocol),
     }
+
+
+def _without_budget(command: Sequence[str]) -> list[str]:
+    """A command without its time limit, which says when it stopped and not what it made."""
+    kept, value = list[str](), False
+    for word in command:
+        option = word.partition("=")[0] == "--budget_minutes"
+        if not option and not value:
+            kept.append(word)
+        value = option and "=" not in word
+    return kept
 
 
 def _version(package: str) -> str:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from offbeat.experiment.protocol import CONTROLS
 from offbeat.report import findings as say
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.findings import Finding, Verdict
-from offbeat.report.pairing import ANCHORED, CONTROLS, FAIR, MODELS, Pair, Rule
+from offbeat.report.pairing import ANCHORED, FAIR, MODELS, Pair, Rule
 from offbeat.report.tables import label
 
 Families = Mapping[tuple[str, str], Sequence[Pair]]

@@ -13,18 +13,11 @@ from offbeat.report import thesis_numbers as thesis
 from offbeat.report.findings import Verdict
 from offbeat.report.pairing import MODELS, Pair, corrected, too_few
 from offbeat.report.records import Record
-from offbeat.report.statistics import (
-    convergence,
-    enough_epochs,
-    paired_comparison,
-    settling,
-)
+from offbeat.report.statistics import convergence, enough_epochs, paired_comparison, settling
 from offbeat.report.table import MIXED, Block, Cell, Table
-from offbeat.report.tables import label, notes, percent
+from offbeat.report.tables import COUNTED, by_share, label, percent
 from offbeat.report.tables_tests import signed
 
-_COLUMNS = tuple(map(percent, thesis.FRACTIONS))
-_COUNTED = "Table A.14 counts the runs behind a cell."
 _OURS, _OTHER = "ode_gru_d", "ode_rnn"
 TOLERANCE = 0.05
 """A run has settled when its validation MSE stays within this of its final one."""
@@ -34,7 +27,7 @@ _NEAR = f"{100 * TOLERANCE:g}\N{THIN SPACE}%"
 def curves_of(
     record: Record, experiment: int, model: str, fraction: float, scoring: str
 ) -> dict[int, NDArray[np.float64]]:
-    """Validation MSE by epoch of each run that has a whole curve, by repeat."""
+    """(epochs,) validation MSE of each run that has a whole curve, by repeat; thesis' units."""
     rows = record.where(experiment=experiment, model=model, fraction=fraction)
     found = {}
     for name, repeat in zip(
@@ -236,20 +229,15 @@ def choice_table(record: Record, *, number: str) -> Table:
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(shown, tuple(rows)))
     chosen = ", ".join(f"{n} at {percent(f)}" for f, n in thesis.CHOSEN_EPOCHS.items())
-    return Table(
+    return by_share(
+        record,
         number,
         "Validation error of experiment 1 after the epochs that the thesis chose, over that at the "
         f"end; in brackets the epoch at which it is within {_NEAR} of its end for the first time, "
         "and from which on it stays so.",
-        "Model",
-        _COLUMNS,
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            f"Chosen: {chosen}. Bold: the curve has settled by then. One run each: a last epoch "
-            "that happens to be good makes all before it look worse.",
-        ),
+        blocks,
+        f"Chosen: {chosen}. Bold: the curve has settled by then. One run each: a last epoch "
+        "that happens to be good makes all before it look worse.",
     )
 
 
@@ -263,22 +251,17 @@ def speed_table(record: Record, *, number: str) -> Table:
                 cells = [_settled(record, experiment, model, f, scoring) for f in thesis.FRACTIONS]
                 rows.append((label(model), tuple(cells)))
             blocks.append(Block(f"Experiment {experiment}, {shown.lower()}", tuple(rows)))
-    return Table(
+    return by_share(
+        record,
         number,
         f"Epochs until the validation MSE stays within {100 * TOLERANCE:g}\N{THIN SPACE}% of the "
         "run's final one: mean over the repeats with a 95 % bootstrap interval, and the single run "
         "of experiment 1.",
-        "Model",
-        _COLUMNS,
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            "A run of experiment 2 is compared with its own end, at 75 or 50 epochs, where its "
-            "error may still be falling: then the epoch says when training was stopped.",
-            _diluted(record),
-            _COUNTED,
-        ),
+        blocks,
+        "A run of experiment 2 is compared with its own end, at 75 or 50 epochs, where its "
+        "error may still be falling: then the epoch says when training was stopped.",
+        _diluted(record),
+        COUNTED,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.errors import InputError
+from offbeat.experiment.protocol import CONTROLS
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.records import Record
 from offbeat.report.statistics import (
@@ -26,10 +27,10 @@ from offbeat.report.tables import LAST_VALUE, label
 
 PLAIN = ("gru", "gru_d")
 FAIR = ("gru_fair", "gru_d_fair")
-CONTROLS = ("gru_unfed", "gru_d_unfed")
 ODE = ("ode_rnn", "ode_gru_d")
 ANCHORED = "anchored_ode_gru_d"
 RANKED = (*thesis.MODELS, *FAIR, ANCHORED)
+"""Models that are ranked against each other: the controls only explain two of them."""
 MODELS = (*RANKED, *CONTROLS)
 """Models of experiment 2, in the order of tables and figures."""
 

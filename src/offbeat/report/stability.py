@@ -11,16 +11,10 @@ from offbeat.report import thesis_numbers as thesis
 from offbeat.report.findings import Verdict
 from offbeat.report.pairing import MODELS, paired_rmse, too_few
 from offbeat.report.records import Record
-from offbeat.report.statistics import (
-    SpreadComparison,
-    holm,
-    spread_comparison,
-)
+from offbeat.report.statistics import SpreadComparison, holm, spread_comparison
 from offbeat.report.table import MIXED, Block, Cell, Table
-from offbeat.report.tables import HEADINGS, label, notes, percent, rmse_of
+from offbeat.report.tables import COUNTED, HEADINGS, by_share, label, percent, rmse_of
 
-_COLUMNS = tuple(map(percent, thesis.FRACTIONS))
-_COUNTED = "Table A.14 counts the runs behind a cell."
 _OURS = "ode_gru_d"
 
 
@@ -156,18 +150,13 @@ def spread_table(record: Record, found: Mapping[str, tuple[Spread, ...]], *, num
                 cells.append(Cell(text, spread, n=len(values), bold=bold, mark=mark))
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(HEADINGS[scoring], tuple(rows)))
-    return Table(
+    return by_share(
+        record,
         number,
         "Standard deviation of the test RMSE over the repeats; in brackets that of "
         f"{label(_OURS)} over it, in the repeats that both have.",
-        "Model",
-        _COLUMNS,
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            f"Below 1: {label(_OURS)} is steadier. Bold: Pitman and Morgan's test for pairs tells "
-            f"the two apart (p ≤ {thesis.ALPHA:g} after Holm).",
-            _COUNTED,
-        ),
+        blocks,
+        f"Below 1: {label(_OURS)} is steadier. Bold: Pitman and Morgan's test for pairs tells "
+        f"the two apart (p ≤ {thesis.ALPHA:g} after Holm).",
+        COUNTED,
     )

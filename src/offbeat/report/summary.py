@@ -6,13 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from offbeat.experiment.protocol import CONTROLS
 from offbeat.report import findings as say
 from offbeat.report import thesis_numbers as thesis
 from offbeat.report.circumstances import machine_facts, time_facts
 from offbeat.report.contents import Contents
-from offbeat.report.pairing import CONTROLS, FAIR, FAMILIES, MODELS, ODE, PLAIN, Pair
+from offbeat.report.pairing import FAIR, FAMILIES, MODELS, ODE, PLAIN, Pair
 from offbeat.report.table import DASH, Table
-from offbeat.report.tables import label, percent, rmse_of
+from offbeat.report.tables import SHARES, label, rmse_of
 from offbeat.report.tables_beyond import constant_of
 from offbeat.report.tables_tests import p_cell, signed
 
@@ -21,7 +22,6 @@ FOLDER = "runs/thesis"
 REPORT = f"offbeat report {FOLDER} --out runs/report"
 DOCUMENT = f"{REPORT} --summary docs/reproduction.md"
 
-_COLUMNS = tuple(map(percent, thesis.FRACTIONS))
 _OURS = "ode_gru_d"
 
 _INFERRED = (
@@ -97,7 +97,7 @@ def _missing(contents: Contents) -> str:
                 lacking[label(model)] = ", ".join(map(str, there)) if any(there) else "none"
         if lacking:
             said.append(f"Experiment {experiment}, of {asked} each: {_grouped(lacking)}.")
-    shares = ", ".join(_COLUMNS)
+    shares = ", ".join(SHARES)
     return f"Runs that are there, at {shares}. {' '.join(said)}" if said else ""
 
 
@@ -156,7 +156,7 @@ def _constant(contents: Contents) -> Iterable[str]:
         spread.append(f"{np.sqrt(rest + own).std(ddof=1):.4f}" if len(runs) > 1 else DASH)
     name = label(_OURS)
     yield _grid(
-        ("", *_COLUMNS),
+        ("", *SHARES),
         [
             ("Published RMSE of a model without any other error", *alone),
             (f"Its share of the published MSE of {name}, ours", *share),
@@ -192,7 +192,7 @@ def _self_feeding(contents: Contents) -> Iterable[str]:
                 rows.append(
                     (f"{label(ode)} minus {label(rival)}, of that minus {label(simple)}", *cells)
                 )
-        yield _grid((f"RMSE, {shown.lower()}", *_COLUMNS), rows)
+        yield _grid((f"RMSE, {shown.lower()}", *SHARES), rows)
     yield (
         "The rows of the ODE models: the mean difference from the other model, and in brackets how "
         "much it is of the difference from the thesis' row; below zero, the other model has the "
@@ -212,7 +212,7 @@ def _differences(contents: Contents) -> Iterable[str]:
         for a, b in keys:
             cells = [_difference(pairs[a, b, f]) for f in thesis.FRACTIONS]
             rows.append((f"{label(a)} minus {label(b)}", *cells))
-    yield _grid(("RMSE, honest scoring", *_COLUMNS), rows)
+    yield _grid(("RMSE, honest scoring", *SHARES), rows)
     tested = [p for name in FAMILIES for p in contents.families[name, "honest"] if p.result]
     asked = sum(len(contents.families[name, "honest"]) for name in FAMILIES)
     if len(tested) < asked:
@@ -266,7 +266,7 @@ def _stability(contents: Contents) -> Iterable[str]:
                 ends = "" if ratio.low is None else f" [{ratio.low:.2f}, {ratio.high:.2f}]"
                 cells.append(_bold(f"{ratio.value:.2f}{ends} ({_p(one.p)})", one.p <= thesis.ALPHA))
             rows.append((label(model), *cells))
-        yield _grid((f"{shown}, against", *_COLUMNS), rows)
+        yield _grid((f"{shown}, against", *SHARES), rows)
     yield (
         f"Standard deviation of the test RMSE of {label(_OURS)} over that of the other model; "
         "below 1 it is the steadier. In brackets p of Pitman and Morgan's test for pairs after "

@@ -39,6 +39,12 @@ def percent(fraction: float) -> str:
     return f"{100 * fraction:g}\N{THIN SPACE}%"
 
 
+SHARES = tuple(map(percent, thesis.FRACTIONS))
+"""Columns of tables with one per observed share."""
+
+COUNTED = "Table A.14 counts the runs behind a cell."
+
+
 def label(name: str) -> str:
     """The name of a model as tables have it."""
     return style_of(name).label
@@ -79,6 +85,27 @@ def notes(record: Record, tables: Sequence[Block], *others: str) -> tuple[str, .
         cell.mark == MIXED for block in tables for _, cells in block.rows for cell in cells
     )
     return (*filter(None, others), *([_MIXED_NOTE] if marked else []))
+
+
+def by_share(
+    record: Record,
+    number: str,
+    caption: str,
+    blocks: Sequence[Block],
+    *said: str,
+    head: str = "Model",
+) -> Table:
+    """A table with a column per observed share; of its notes those that are not empty.
+
+    Args:
+        record: what the numbers are of.
+        number: of the table.
+        caption: a sentence, without the number.
+        blocks: rows with a cell per share, in the order of `SHARES`.
+        said: notes, after which come those that every table has.
+        head: of the first column.
+    """
+    return Table(number, caption, head, SHARES, tuple(blocks), notes(record, blocks, *said))
 
 
 # --- tables 3.1 to 3.4 ----------------------------------------------------------------------------
@@ -192,13 +219,14 @@ def final_table(record: Record) -> Table:
             cells.append(mean_cell(record, values, runs, digits=digits))
         rows.append((label(LAST_VALUE), cells))
         blocks.append(Block(HEADINGS[scoring], bold_lowest(rows)))
-    return Table(
+    return by_share(
+        record,
         "3.5",
         f"Test MSE after {_epochs_of(record)} epochs, by the share of observed rows.",
-        "Model",
-        tuple(map(percent, thesis.FRACTIONS)),
-        tuple(blocks),
-        notes(record, blocks, _BOLD_NOTE, _SELF_FEEDING, missing_runs(record, 1, thesis.MODELS, 1)),
+        blocks,
+        _BOLD_NOTE,
+        _SELF_FEEDING,
+        missing_runs(record, 1, thesis.MODELS, 1),
     )
 
 
@@ -222,19 +250,14 @@ def repeats_table(record: Record, *, repeats: int = thesis.REPEATS) -> Table:
     for scoring in ("published", "honest"):
         rows = rmse_rows(record, thesis.MODELS, scoring, repeats=repeats)
         blocks.append(Block(HEADINGS[scoring], bold_lowest(rows)))
-    return Table(
+    return by_share(
+        record,
         "3.6",
         "Test RMSE over the repeats, mean ± standard deviation, by the share of observed rows.",
-        "Model",
-        tuple(map(percent, thesis.FRACTIONS)),
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            _BOLD_NOTE,
-            _SELF_FEEDING,
-            missing_runs(record, 2, thesis.MODELS, repeats),
-        ),
+        blocks,
+        _BOLD_NOTE,
+        _SELF_FEEDING,
+        missing_runs(record, 2, thesis.MODELS, repeats),
     )
 
 

@@ -11,16 +11,15 @@ from offbeat.report.records import Record
 from offbeat.report.table import MINUS, MIXED, TIMES, Block, Cell, Table, bold_lowest
 from offbeat.report.tables import (
     HEADINGS,
+    SHARES,
+    by_share,
     label,
     missing_runs,
-    notes,
-    percent,
     rmse_of,
     rmse_rows,
 )
 
 Values = NDArray[np.float64]
-_COLUMNS = tuple(map(percent, thesis.FRACTIONS))
 _WITHIN = 2.0
 """Standard deviations of the thesis within which a cell of table 3.6 counts as reproduced."""
 
@@ -32,20 +31,15 @@ def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
         Block(headings[scoring], bold_lowest(rmse_rows(record, MODELS, scoring, repeats=repeats)))
         for scoring in ("published", "honest", "honest_hidden")
     ]
-    return Table(
+    return by_share(
+        record,
         number,
         "Test RMSE of all models over the repeats, mean ± standard deviation.",
-        "Model",
-        _COLUMNS,
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            "Bold: the lowest of its column within a block, where all are there. Not self-fed: "
-            "the thesis' rows without self-feeding. Fair: not self-fed either, updated at every "
-            "row, GRU with the age of each channel as input.",
-            missing_runs(record, 2, MODELS, repeats),
-        ),
+        blocks,
+        "Bold: the lowest of its column within a block, where all are there. Not self-fed: "
+        "the thesis' rows without self-feeding. Fair: not self-fed either, updated at every "
+        "row, GRU with the age of each channel as input.",
+        missing_runs(record, 2, MODELS, repeats),
     )
 
 
@@ -97,19 +91,14 @@ def distance_table(record: Record, *, number: str) -> Table:
         ),
         Block("c at which our mean would be the thesis' (inferred)", tuple(needed)),
     )
-    return Table(
+    return by_share(
+        record,
         number,
         "Distance of our test RMSE from table 3.6, published scoring.",
-        "Model",
-        _COLUMNS,
         blocks,
-        notes(
-            record,
-            blocks,
-            f"Bold: within {_WITHIN:g} of the thesis' standard deviations. Nothing is tuned to "
-            "match. c is a property of the draw of initial states: normalisation divides by the "
-            "largest of single frames, so another draw has another c, and other units.",
-        ),
+        f"Bold: within {_WITHIN:g} of the thesis' standard deviations. Nothing is tuned to "
+        "match. c is a property of the draw of initial states: normalisation divides by the "
+        "largest of single frames, so another draw has another c, and other units.",
     )
 
 
@@ -178,13 +167,12 @@ def runs_table(record: Record, *, repeats: int, number: str) -> Table:
                 cells.append(Cell(f"{there} of {asked}", float(there), n=there, bold=not whole))
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(f"Experiment {experiment}", tuple(rows)))
-    return Table(
+    return by_share(
+        record,
         number,
         "Runs that are there, of those of the full protocol.",
-        "Model",
-        _COLUMNS,
-        tuple(blocks),
-        ("Bold: not all of them.",),
+        blocks,
+        "Bold: not all of them.",
     )
 
 
@@ -219,7 +207,7 @@ def cost_table(record: Record, *, number: str) -> Table:
         "Run time in minutes, summed over the runs of a cell; its share of all, and per step of "
         "the optimizer.",
         "Model",
-        (*_COLUMNS, "Sum (min)", "Share (%)", "Per step (ms)"),
+        (*SHARES, "Sum (min)", "Share (%)", "Per step (ms)"),
         tuple(blocks),
         ("A run's time is its wall time, with as many threads as the record says.",),
     )

@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from offbeat.errors import InputError
+from offbeat.experiment.protocol import CONTROLS
 from offbeat.report import thesis_numbers as thesis
-from offbeat.report.pairing import CONTROLS, FAIR, Pair, Rule
+from offbeat.report.pairing import FAIR, Pair, Rule
 from offbeat.report.records import Record
 from offbeat.report.statistics import FriedmanResult, shapiro_wilk
 from offbeat.report.table import MINUS, MIXED, Block, Cell, Table
-from offbeat.report.tables import HEADINGS, LAST_VALUE, label, notes, percent, rmse_of
+from offbeat.report.tables import (
+    HEADINGS,
+    LAST_VALUE,
+    SHARES,
+    by_share,
+    label,
+    notes,
+    percent,
+    rmse_of,
+)
 
 SCORING_NAMES = {
     "published": "published scoring",
@@ -18,7 +28,6 @@ SCORING_NAMES = {
     "honest_hidden": "honest scoring, hidden rows only",
 }
 
-_COLUMNS = tuple(map(percent, thesis.FRACTIONS))
 _SIGNIFICANT = f"Bold: below the level of significance, {thesis.ALPHA:g}."
 _FAIR = (
     "Not self-fed: the thesis' rows without self-feeding, and nothing else changed. Fair: not "
@@ -65,13 +74,12 @@ def normality_table(record: Record) -> Table:
                 cells.append(p_cell(outcome.p, n=len(values), mark=mark))
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(HEADINGS[scoring], tuple(rows)))
-    return Table(
+    return by_share(
+        record,
         "3.7",
         "Shapiro-Wilk test of the test RMSE over the repeats: p-values.",
-        "Model",
-        _COLUMNS,
-        tuple(blocks),
-        notes(record, blocks, f"{_SIGNIFICANT} There a normal distribution is rejected."),
+        blocks,
+        f"{_SIGNIFICANT} There a normal distribution is rejected.",
     )
 
 
@@ -112,21 +120,17 @@ def rule_table(record: Record, rules: Mapping[tuple[str, str], Sequence[Rule]]) 
         heading = f"{HEADINGS[scoring]}: {label(first)} and {label('ode_gru_d')}"
         rows = zip(names.values(), zip(*columns, strict=True), strict=True)
         blocks.append(Block(heading, tuple(rows)))
-    return Table(
+    return by_share(
+        record,
         "3.8",
         "The thesis' rule on the test RMSE: p-values of Bartlett's test, then of the two-sample t "
         "test where Bartlett's p is above 0.05, else of Welch's.",
-        "Test",
-        _COLUMNS,
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            _SIGNIFICANT,
-            _CAVEAT,
-            thesis.SLIPS["3.8"],
-            " ".join(dict.fromkeys(missing)),
-        ),
+        blocks,
+        _SIGNIFICANT,
+        _CAVEAT,
+        thesis.SLIPS["3.8"],
+        " ".join(dict.fromkeys(missing)),
+        head="Test",
     )
 
 
@@ -223,22 +227,18 @@ def family_table(
             )
         missing += [p.missing for p in pairs if p.missing]
         blocks.append(Block(heading, tuple(rows)))
-    return Table(
+    return by_share(
+        record,
         number,
         caption,
-        f"First {MINUS} second",
-        _COLUMNS,
-        tuple(blocks),
-        notes(
-            record,
-            blocks,
-            f"In brackets p of the paired t test, corrected by Holm within a block. Bold: p ≤ "
-            f"{thesis.ALPHA:g}. Negative: the first is better.",
-            _FAIR
-            if all({p.a, p.b} & {*CONTROLS, *FAIR} for ps in families.values() for p in ps)
-            else "",
-            f"Pairs without a number lack runs ({len(missing)})." if missing else "",
-        ),
+        blocks,
+        f"In brackets p of the paired t test, corrected by Holm within a block. Bold: p ≤ "
+        f"{thesis.ALPHA:g}. Negative: the first is better.",
+        _FAIR
+        if all({p.a, p.b} & {*CONTROLS, *FAIR} for ps in families.values() for p in ps)
+        else "",
+        f"Pairs without a number lack runs ({len(missing)})." if missing else "",
+        head=f"First {MINUS} second",
     )
 
 
@@ -298,7 +298,7 @@ def ranks_table(
         number,
         f"Ranks of the models over the repeats by test RMSE, {SCORING_NAMES[scoring]}.",
         "Model",
-        _COLUMNS,
+        SHARES,
         tuple(blocks),
         tuple(
             filter(
