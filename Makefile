@@ -75,7 +75,7 @@ define install
 	@rm .venv/.installing
 endef
 
-SOURCES := pyproject.toml constraints.txt CMakeLists.txt $(wildcard csrc/*)
+SOURCES := pyproject.toml constraints.txt CMakeLists.txt $(wildcard csrc/* csrc/*/*)
 
 .venv/.sim: .venv/.made $(SOURCES)
 	$(call install,sim)

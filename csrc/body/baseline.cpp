@@ -3,7 +3,7 @@
 
 #include <initializer_list>
 
-#include "scan.hpp"
+#include "../records.hpp"
 #if defined(__aarch64__)
 #include <arm_neon.h>
 #endif
@@ -13,8 +13,8 @@
 namespace offbeat {
 namespace {
 #include "vector.hpp"
-#include "body.hpp"
-#include "body_table.hpp"
+#include "scan.hpp"
+#include "table.hpp"
 }  // namespace
 
 extern const Bodies body_baseline;

@@ -1,4 +1,4 @@
-// One row of one trajectory, without a gradient: part of Scan<T> (body.hpp). It runs the same
+// One row of one trajectory, without a gradient: part of Scan<T> (scan.hpp). It runs the same
 // `row_forward` as a batch, with vectors over units in place of lanes.
 
 static int stream_facts(const Dims& d) {

@@ -1,4 +1,5 @@
-// A perceptron over many rows, forward and backward: part of Scan<T> (body.hpp). The decoder is one.
+// A perceptron over many rows, forward and backward: part of Scan<T> (scan.hpp). The decoder is
+// one.
 
 static Map perceptron_map(const Perceptron& shape) {
   Spec s{};

@@ -3,7 +3,7 @@
 
 #include <initializer_list>
 
-#include "scan.hpp"
+#include "../records.hpp"
 #include <immintrin.h>
 
 #define VECTOR_BYTES 64
@@ -11,8 +11,8 @@
 namespace offbeat {
 namespace {
 #include "vector.hpp"
-#include "body.hpp"
-#include "body_table.hpp"
+#include "scan.hpp"
+#include "table.hpp"
 }  // namespace
 
 extern const Bodies body_avx512;

@@ -1,4 +1,4 @@
-// The table of functions that a body offers; included at the end of each body_*.cpp.
+// The table of functions that a body offers; included at the end of each body.
 
 template <class T>
 constexpr Body<T> table() {

@@ -1,8 +1,8 @@
-// The backward pass of a block: part of Scan<T> (body.hpp).
+// The backward pass of a block: part of Scan<T> (scan.hpp).
 //
-// Rows go by in groups, last first. The tape of a group is what the forward pass kept, or is computed
-// again. What reaches each matrix in a group is added to its gradient in one go, so that the
-// gradient's own traffic through the cache is paid once per group.
+// Rows go by in groups, last first. The tape of a group is what the forward pass kept, or is
+// computed again. What reaches each matrix in a group is added to its gradient in one go, so that
+// the gradient's own traffic through the cache is paid once per group.
 
 // Products that wait to be added: to_out (out, lane) times x (in, lane), summed over lanes.
 static constexpr int MAX_PAIRS = 128, PAIRS_AT_ONCE = 8;
@@ -186,7 +186,8 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
         store<T>(g + i, (1 - m) * load<T>(g + i) - m * load<T>(k.z + i));
       });
     }
-    if (shown_matters) P::template transposed<false>(c.map.m[M_IN], c.packed, c.lanes, gate, k.shown);
+    if (shown_matters)
+      P::template transposed<false>(c.map.m[M_IN], c.packed, c.lanes, gate, k.shown);
   }
   collect<P>(job, b, job.to_before, row, d.S, true, g);
 
@@ -292,7 +293,8 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
 }
 
 template <class P>
-static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stages, T* kept) {
+static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stages,
+                                          T* kept) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
   const Layout<P>& l = c.l;
@@ -322,7 +324,8 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
 
 // Fills the gradient of the gates; turns those of h and of the memory into the ones before.
 template <class P>
-static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* gh, T* gc) {
+static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* gh,
+                                   T* gc) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
   const Dims& d = c.map.d;

@@ -1,0 +1,199 @@
+// Affine maps of a block or of a stream, and activations: part of Scan<T> (scan.hpp).
+
+// What becomes of a product before it is stored, at an offset of its result.
+struct Plain {
+  INLINE V operator()(V a, int64_t) const { return a; }
+};
+struct TimesTanhSlope {  // that follows from the value of tanh
+  const T* value;
+  INLINE V operator()(V a, int64_t i) const {
+    const V y = load<T>(value + i);
+    return a * fma(-y, y, splat(1));
+  }
+};
+
+// y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order.
+template <int NV, bool ACCUMULATE, class Finish>
+static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x, T* y,
+                         int64_t at, const Finish& finish) {
+  y += at;
+  constexpr int W = NV * VW;
+  V acc[TILE][NV];
+  for (int r = 0; r < TILE; ++r)
+    for (int v = 0; v < NV; ++v) {
+      if (ACCUMULATE)
+        acc[r][v] = r < rows ? load<T>(y + r * W + v * VW) : splat(0);
+      else
+        acc[r][v] = splat(bias ? bias[r] : T(0));
+    }
+  for (int k = 0; k < in; ++k) {
+    V xv[NV];
+    for (int v = 0; v < NV; ++v) xv[v] = load<T>(x + int64_t(k) * W + v * VW);
+    for (int r = 0; r < TILE; ++r) {
+      const V wv = splat(w[k * TILE + r]);
+      for (int v = 0; v < NV; ++v) acc[r][v] = fma(wv, xv[v], acc[r][v]);
+    }
+  }
+  for (int r = 0; r < TILE; ++r)
+    if (r < rows)
+      for (int v = 0; v < NV; ++v)
+        store<T>(y + r * W + v * VW, finish(acc[r][v], at + r * W + v * VW));
+}
+
+// The same for `LANES` lanes of a vector that is mostly empty: vectors over the outputs of N
+// panels, so that lanes which are not there cost nothing. They are set to 0.
+template <int LANES, int N, bool ACCUMULATE, class Finish>
+static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y,
+                              int64_t at, const Finish& finish) {
+  y += at;
+  static_assert(TILE == 4, "a panel is four floats wide");
+  F4 acc[N][LANES];
+  for (int n = 0; n < N; ++n)
+    for (int lane = 0; lane < LANES; ++lane)
+      for (int r = 0; r < TILE; ++r) {
+        const int o = n * TILE + r;
+        acc[n][lane][r] = ACCUMULATE ? (o < rows ? y[o * VW + lane] : T(0))
+                                     : (bias ? bias[o] : T(0));
+      }
+  for (int k = 0; k < in; ++k)
+    for (int n = 0; n < N; ++n) {
+      const F4 wv = load_four(w + (int64_t(n) * in + k) * TILE);
+      for (int lane = 0; lane < LANES; ++lane)
+        acc[n][lane] = fma_four(wv, x[int64_t(k) * VW + lane] - F4{}, acc[n][lane]);
+    }
+  for (int o = 0; o < N * TILE && o < rows; ++o) {
+    store<T>(y + o * VW, splat(0));
+    for (int lane = 0; lane < LANES; ++lane) y[o * VW + lane] = acc[o / TILE][lane][o % TILE];
+    store<T>(y + o * VW, finish(load<T>(y + o * VW), at + o * VW));
+  }
+}
+template <int LANES, int N, bool ACCUMULATE, class Finish>
+static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y,
+                         const Finish& finish) {
+  int o = 0;
+  for (; o + N * TILE <= out; o += N * TILE)
+    few_panels<LANES, N, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, N * TILE, in,
+                                     x, y, int64_t(o) * VW, finish);
+  for (; o < out; o += TILE)
+    few_panels<LANES, 1, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, out - o, in,
+                                     x, y, int64_t(o) * VW, finish);
+}
+
+// A policy of lanes: a block of NV vectors of lanes, or the one lane of a stream.
+template <int NV>
+struct Many {
+  static constexpr int W = NV * VW, N = NV;  // distance of units, vectors of a per-lane quantity
+  static constexpr bool ONE = false;
+  static int pad(int n) { return n; }
+  template <bool ACCUMULATE>
+  static NOINLINE void affine(const Matrix& m, const T* packed, int lanes, const T* x, T* y) {
+    product<ACCUMULATE>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out,
+                        m.in, lanes, x, y, Plain{});
+  }
+  // x[k] (+)= sum over o of w[o][k] y[o]
+  template <bool ACCUMULATE>
+  static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
+    product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
+                        Plain{});
+  }
+  // The same, times the slope of tanh where its value is `value`.
+  static NOINLINE void through_tanh(const Matrix& m, const T* packed, int lanes, const T* y,
+                                    const T* value, T* x) {
+    product<false>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
+                   TimesTanhSlope{value});
+  }
+  template <bool ACCUMULATE, class Finish>
+  static INLINE void product(const T* w, const T* bias, int out, int in, int lanes, const T* x,
+                             T* y, const Finish& finish) {
+    if constexpr (NV == 1 && sizeof(T) == 4) {
+      if (lanes == 1) return few<1, 8, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (lanes == 2) return few<2, 4, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (VW > 4 && lanes == 3) return few<3, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (VW > 4 && lanes == 4) return few<4, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
+    }
+    for (int o = 0; o < out; o += TILE)
+      panel<NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
+                            out - o < TILE ? out - o : TILE, in, x, y, int64_t(o) * W, finish);
+  }
+  template <class Fn>
+  static INLINE void each(int units, Fn fn) {
+    for (int u = 0; u < units; ++u)
+      for (int v = 0; v < NV; ++v) fn(int64_t(u) * W + v * VW, v * VW);
+  }
+  // The same with a constant of each unit, as [unit].
+  template <class Fn>
+  static INLINE void each_unit(int units, Fn fn) {
+    for (int u = 0; u < units; ++u)
+      for (int v = 0; v < NV; ++v) fn(int64_t(u) * W + v * VW, v * VW, u);
+  }
+  static INLINE V constant(const T* p, int u) { return splat(p[u]); }
+};
+
+struct One {
+  static constexpr int W = 1, N = 1;
+  static constexpr bool ONE = true;
+  static int pad(int n) { return up(n, VW); }
+  template <bool ACCUMULATE>
+  static NOINLINE void affine(const Matrix& m, const T* packed, int, const T* x, T* y) {
+    const T* w = packed + m.stream_panels;
+    const T* bias = m.bias >= 0 ? packed + m.stream_bias : nullptr;
+    const int first = m.in_split, second = m.in - first;
+    const T* x2 = x + pad(first);
+    int o = 0;
+    // Several panels side by side hide the latency of a sum.
+    for (; o + 4 * VW <= m.padded_out; o += 4 * VW)
+      panels<4, ACCUMULATE>(w + int64_t(o) * m.in, bias, o, first, second, m.in, x, x2, y);
+    for (; o + 2 * VW <= m.padded_out; o += 2 * VW)
+      panels<2, ACCUMULATE>(w + int64_t(o) * m.in, bias, o, first, second, m.in, x, x2, y);
+    for (; o < m.padded_out; o += VW)
+      panels<1, ACCUMULATE>(w + int64_t(o) * m.in, bias, o, first, second, m.in, x, x2, y);
+  }
+  template <int N, bool ACCUMULATE>
+  static INLINE void panels(const T* w, const T* bias, int o, int first, int second, int in,
+                            const T* x, const T* x2, T* y) {
+    V acc[N];
+    for (int n = 0; n < N; ++n)
+      acc[n] = ACCUMULATE ? load<T>(y + o + n * VW)
+                          : bias ? load<T>(bias + o + n * VW) : splat(0);
+    for (int k = 0; k < first; ++k) {
+      const V xv = splat(x[k]);
+      for (int n = 0; n < N; ++n)
+        acc[n] = fma(load<T>(w + (int64_t(n) * in + k) * VW), xv, acc[n]);
+    }
+    for (int k = 0; k < second; ++k) {
+      const V xv = splat(x2[k]);
+      for (int n = 0; n < N; ++n)
+        acc[n] = fma(load<T>(w + (int64_t(n) * in + first + k) * VW), xv, acc[n]);
+    }
+    for (int n = 0; n < N; ++n) store<T>(y + o + n * VW, acc[n]);
+  }
+  template <class Fn>
+  static INLINE void each(int units, Fn fn) {
+    for (int u = 0; u < units; u += VW) fn(int64_t(u), 0);
+  }
+  template <class Fn>
+  static INLINE void each_unit(int units, Fn fn) {
+    for (int u = 0; u < units; u += VW) fn(int64_t(u), 0, u);
+  }
+  static INLINE V constant(const T* p, int u) { return load<T>(p + u); }
+};
+
+template <class P>
+static NOINLINE void activate(int activation, int units, const T* z, T* value, T* slope) {
+  if (activation == TANH) {
+    P::each(units, [&](int64_t i, int) { store<T>(value + i, tanh_(load<T>(z + i))); });
+    return;
+  }
+  P::each(units, [&](int64_t i, int) {
+    const V x = load<T>(z + i), s = sigmoid_(x);
+    store<T>(slope + i, fma(x * s, 1 - s, s));
+    store<T>(value + i, x * s);
+  });
+}
+// to_z = to_value * slope
+template <class P>
+static NOINLINE void activate_backward(int units, const T* slope, const T* to_value, T* to_z) {
+  P::each(units, [&](int64_t i, int) {
+    store<T>(to_z + i, load<T>(to_value + i) * load<T>(slope + i));
+  });
+}

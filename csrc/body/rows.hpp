@@ -1,0 +1,204 @@
+// What is known of a row, gathered for the lanes of a block, and what is kept of it for the
+// backward pass: part of Scan<T> (scan.hpp).
+
+// --- between [lane][unit], as callers have it, and [unit][lane] ---------------------------------
+
+// out[unit * W + lane] = lanes[lane][unit]
+static NOINLINE void lanes_to_units(const T* const* lanes, int units, int W, T* out) {
+  int first = 0;
+  if constexpr (FAST_TURN && sizeof(T) == 4)
+    if (units >= 8 && W % 8 == 0)
+      for (; first < units; first += 8) {
+        const int u = first + 8 <= units ? first : units - 8;  // the last eight may overlap
+        for (int lane = 0; lane < W; lane += 8)
+          turn_8_by_8([&](int i) { return lanes[lane + i] + u; },
+                      [&](int i) { return out + int64_t(u + i) * W + lane; });
+      }
+  for (int lane = 0; lane < W; ++lane)
+    for (int u = first; u < units; ++u) out[int64_t(u) * W + lane] = lanes[lane][u];
+}
+// lanes[lane][unit] = x[unit * W + lane], for the first `n` lanes
+static NOINLINE void units_to_lanes(const T* x, int units, int n, int W, T* const* lanes) {
+  for (int lane = 0; lane < n; ++lane) {
+    int first = 0;
+    if constexpr (FAST_TURN && sizeof(T) == 4)
+      if (units >= 8 && lane + 8 <= n) {
+        for (; first < units; first += 8) {
+          const int u = first + 8 <= units ? first : units - 8;
+          turn_8_by_8([&](int i) { return x + int64_t(u + i) * W + lane; },
+                      [&](int i) { return lanes[lane + i] + u; });
+        }
+        lane += 7;
+        continue;
+      }
+    for (int u = first; u < units; ++u) lanes[lane][u] = x[int64_t(u) * W + lane];
+  }
+}
+
+// --- what is kept of a row ----------------------------------------------------------------------
+
+// Offsets in units, each to be multiplied by the policy's W. `Net` is one evaluation.
+struct Net {
+  int value[MAX_LAYERS], slope[MAX_LAYERS], size;
+};
+template <class P>
+static Net net(const Perceptron& shape) {
+  Net n{};
+  for (int l = 0; l + 1 < shape.layers; ++l) {
+    n.value[l] = n.size, n.size += P::pad(shape.sizes[l + 1]);
+    n.slope[l] = n.size;
+    if (shape.activation == SILU) n.size += P::pad(shape.sizes[l + 1]);
+  }
+  return n;
+}
+template <class P>
+struct Layout {
+  int u, start, end, before, gate, held, innovation, decoded, hidden, carried;
+  int decoder, step, step_size, applied, factor, arrived, stage, stage_size, y, network, size;
+  Net field_net, decoder_net;
+  int x_at, h_at, c_at, state;  // inside a state
+};
+template <class P>
+static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
+  Layout<P> l{};
+  int at = 0;
+  auto take = [&](int n) {
+    const int here = at;
+    at += P::pad(n);
+    return here;
+  };
+  l.h_at = P::pad(d.A);
+  l.c_at = l.h_at + P::pad(d.H);
+  l.state = l.c_at + (d.lstm ? P::pad(d.H) : 0);
+  l.u = at, at += P::pad(d.I) + (P::ONE ? VW : 0);
+  l.carried = take(s.decoder.layers || d.lstm ? d.H : 0);
+  l.start = take(d.F ? d.H : 0);
+  l.end = take(d.F ? d.H : 0);
+  l.before = at, at += l.state;
+  l.gate = at, at += d.cell ? d.G / d.H * P::pad(d.H) : 0;
+  l.held = take(d.H);
+  l.hidden = take(d.H);
+  l.innovation = take(d.A);
+  l.decoded = take(s.decoder.layers ? d.C : 0);
+  l.decoder_net = net<P>(s.decoder);
+  l.decoder = at, at += l.decoder_net.size;
+  l.field_net = net<P>(s.field);
+  l.step = at;
+  int step = 0;
+  if (d.F) {
+    l.applied = step, step += P::pad(d.H);
+    l.factor = step, step += P::pad(d.H);
+    l.arrived = step, step += P::pad(d.H);
+  }
+  l.stage = step;
+  l.y = 0;
+  l.network = P::pad(d.A) + P::pad(d.H);
+  l.stage_size = s.field.layers ? l.network + l.field_net.size : 0;
+  step += l.stage_size * s.stages;
+  l.step_size = step;
+  l.size = at + step * max_steps;
+  return l;
+}
+// Every policy of blocks has the same layout in units.
+static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
+  return int64_t(layout<Many<1>>(s, dims(s), max_steps).size) * VW * vectors;
+}
+
+// The facts of one row for the lanes of a block; a lane that has ended stands still.
+template <class P>
+struct Facts {
+  T *gap, *update, *updated, *alive, *values, *mask, *age, *start, *end, *delta, *last;
+  const T* mean;
+  T* nothing;  // zeros for a lane that has ended
+  bool active = false, fed = false;
+};
+static constexpr int LANE_FACTS = 4;
+static int facts_size(const Dims& d, int lanes) {
+  return LANE_FACTS * (lanes < VW ? VW : lanes) + (4 * d.C + d.ages + 2 * d.F) * lanes +
+         widest_fact(d);
+}
+static int widest_fact(const Dims& d) {
+  return up(d.C > d.ages ? (d.C > d.F ? d.C : d.F) : (d.ages > d.F ? d.ages : d.F), 16);
+}
+template <class P>
+static Facts<P> facts(const Dims& d, T* at) {
+  Facts<P> f{};
+  for (T** p : {&f.gap, &f.update, &f.updated, &f.alive}) *p = at, at += P::W;
+  f.values = at, at += d.C * P::W;
+  f.mask = at, at += d.C * P::W;
+  f.age = at, at += d.ages * P::W;
+  f.start = at, at += d.F * P::W;
+  f.end = at, at += d.F * P::W;
+  f.delta = at, at += d.C * P::W;
+  f.last = at, at += d.C * P::W;
+  f.nothing = at;
+  zero(f.nothing, widest_fact(d));
+  return f;
+}
+// Rows of many trajectories lie far apart: what is needed `ahead` rows on is asked for now.
+template <class P>
+static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, int row,
+                            Facts<P>& f, int ahead) {
+  const bool more = row + ahead >= 0 && row + ahead < b.rows;
+  f.fed = job.rows.fed && job.rows.fed[row];
+  f.active = false;
+  for (int lane = 0; lane < P::W; ++lane) {
+    const int64_t at = lane < b.lanes ? job.source[b.first + lane] : 0;
+    const bool alive = lane < b.lanes && row < job.length[b.first + lane];
+    f.alive[lane] = alive;
+    auto one = [&](const Fact<T>& fact) {
+      return alive && fact.data ? fact.data[at * fact.by_lane + row * fact.by_row] : T(0);
+    };
+    if (more && lane < b.lanes)
+      __builtin_prefetch(job.rows.gap.data + at * job.rows.gap.by_lane +
+                         (row + ahead) * job.rows.gap.by_row);
+    f.gap[lane] = one(job.rows.gap);
+    f.update[lane] = one(job.rows.update);
+    f.updated[lane] = one(job.rows.updated);
+    f.active |= d.cell && f.update[lane] != 0;
+  }
+  auto many = [&](const Fact<T>& fact, int n, T* out) {
+    if (!fact.data || !n) return;
+    const T* lanes[P::W];
+    for (int lane = 0; lane < P::W; ++lane)
+      lanes[lane] = f.alive[lane] != 0
+                        ? fact.data + int64_t(job.source[b.first + lane]) * fact.by_lane +
+                              row * fact.by_row
+                        : f.nothing;
+    if (more)
+      for (int lane = 0; lane < b.lanes; ++lane) {
+        const T* next = fact.data + int64_t(job.source[b.first + lane]) * fact.by_lane +
+                        (row + ahead) * fact.by_row;
+        for (int u = 0; u < n; u += 64 / int(sizeof(T))) __builtin_prefetch(next + u);
+        __builtin_prefetch(next + n - 1);
+      }
+    lanes_to_units(lanes, n, P::W, out);
+  };
+  many(job.rows.values, d.C, f.values);
+  many(job.rows.mask, d.C, f.mask);
+  many(job.rows.age, d.ages, f.age);
+  many(job.rows.decay_start, d.F, f.start);
+  many(job.rows.decay_end, d.F, f.end);
+  many(job.rows.delta, d.C, f.delta);
+  many(job.rows.last, d.C, f.last);
+  f.mean = job.rows.mean;
+}
+
+static INLINE V clip(V a) {
+  a = a < T(0) ? splat(0) : a;
+  return a > LARGEST_EXPONENT ? splat(LARGEST_EXPONENT) : a;
+}
+static INLINE V inside(V a) {  // derivative of clip
+  return a >= T(0) ? (a <= LARGEST_EXPONENT ? splat(1) : splat(0)) : splat(0);
+}
+
+template <class P>
+struct Context {
+  const Spec& s;
+  const Map& map;
+  const T* packed;
+  const T* input_decay;  // weights, then biases
+  Layout<P> l;
+  T* work;               // slopes of the stages, and other scratch
+  int lanes = P::W;      // that there are; the others are padding
+};

@@ -1,0 +1,179 @@
+// A batch, forward and backward: part of module.cpp.
+
+// Everything of a call that forward and backward share.
+template <class T>
+struct Call {
+  Job<T> job;
+  std::vector<int32_t> order, length, source;
+  std::vector<Block> blocks;
+  std::vector<Slot> slots;
+  int64_t tape = 0;
+
+  void order_lanes(int64_t batch, int64_t rows, const int64_t* lengths, const int64_t* index) {
+    job.batch = batch, job.n_rows = rows;
+    order.resize(batch);
+    std::iota(order.begin(), order.end(), 0);
+    auto of = [&](int32_t i) {
+      return lengths ? std::clamp<int64_t>(lengths[i], 0, rows) : rows;
+    };
+    std::stable_sort(order.begin(), order.end(),
+                     [&](int32_t i, int32_t j) { return of(i) > of(j); });
+    for (int32_t i : order) {
+      length.push_back(int32_t(of(i)));
+      source.push_back(index ? int32_t(index[i]) : i);
+    }
+    job.order = order.data(), job.length = length.data(), job.source = source.data();
+  }
+
+  void plan(const Spec& s, const Body<T>& body) {
+    job.spec = &s;
+    const int64_t batch = job.batch;
+    const int w = body.width;
+    for (int64_t at = 0; at < batch;) {
+      Block b;
+      b.first = int(at);
+      b.vectors = batch - at > w ? 2 : 1;
+      b.lanes = int(std::min<int64_t>(batch - at, int64_t(b.vectors) * w));
+      b.rows = length[at];
+      b.tape = tape;
+      tape += int64_t(b.rows) * body.tape_row(s, job.max_steps, b.vectors);
+      blocks.push_back(b);
+      at += b.lanes;
+    }
+    // Sums of gradients: a place of its own for each block, or for some neighbours.
+    const int n = int(blocks.size()), most = 64;
+    const int count = std::min(n, most);
+    for (int i = 0; i < count; ++i)
+      slots.push_back({int(int64_t(n) * i / count), int(int64_t(n) * (i + 1) / count)});
+    job.blocks = blocks.data(), job.slots = slots.data();
+  }
+
+  // Rows between two looks at who is behind: a sixteenth of all, in whole groups.
+  int stretch() const {
+    const int rows = std::max(1, int(job.n_rows) / 16);
+    return (rows + job.group - 1) / job.group * job.group;
+  }
+};
+
+template <class T>
+int most_steps(const Spec& s, const Fact<T>& gap, const std::vector<int32_t>& source,
+               int64_t rows) {
+  int64_t most = s.steps;
+  if (s.max_step > 0 && s.field.layers) {
+    T longest = 0;
+    for (int64_t i : source)
+      for (int64_t j = 0; j < rows; ++j)
+        longest = std::max(longest, gap.data[i * gap.by_lane + j * gap.by_row]);
+    const T wanted = std::ceil(longest / T(s.max_step) - T(1e-6));
+    if (!(wanted < T(1e6)))
+      refuse("a gap asks for over a million steps; raise max_step");
+    most = std::max<int64_t>(most, int64_t(wanted));
+  }
+  return int(most);
+}
+
+template <class T>
+Call<T> prepare(const Spec& s, const Body<T>& body, const Facts<T>& f, const Const<T>& state) {
+  const int64_t batch = state.ndim() ? int64_t(state.shape(0)) : 0;
+  check_shape("state", state, {batch, state_of(s)});
+  check_contiguous("state", state);
+  if (batch < 1 || f.rows < 1) refuse("a scan needs at least one trajectory and one row");
+  if (f.table) f.check_table(batch);
+  Call<T> call;
+  take_rows(call.job, s, f, batch);
+  const int64_t* lengths = nullptr;
+  if (f.length) {
+    check_shape("length", *f.length, {batch});
+    lengths = f.length->data();
+  }
+  call.job.state = state.data();
+  call.order_lanes(batch, f.rows, lengths, f.index ? f.index->data() : nullptr);
+  call.job.max_steps = most_steps(s, call.job.rows.gap, call.source, f.rows);
+  call.plan(s, body);
+  // Enough lanes per addition to the gradients, and no more memory than that takes.
+  const int evaluations = s.field.layers ? s.stages * call.job.max_steps : 1;
+  call.job.group = std::clamp(8 / evaluations, 1, MAX_GROUP);
+  return call;
+}
+
+template <class T>
+std::unique_ptr<Buffer<T>> packed(const Spec& s, const Body<T>& body, const Const<T>& weights) {
+  check_shape("weights", weights, {flat_size(s)});
+  auto buffer = std::make_unique<Buffer<T>>(body.packed_size(s));
+  body.pack(s, weights.data(), buffer->get());
+  return buffer;
+}
+
+template <class T>
+int64_t tape_size(const Spec& s, const Bodies& named, const Facts<T>& f, const Const<T>& state) {
+  return prepare<T>(s, typed<T>(named), f, state).tape;
+}
+
+template <class T>
+void scan_forward(const Spec& s, const Bodies& named, const Const<T>& weights, const Facts<T>& f,
+                  const Const<T>& state, Array<T> before, Array<T> after,
+                  std::optional<Array<T>> tape, int threads) {
+  const Body<T>& body = typed<T>(named);
+  Call<T> call = prepare<T>(s, body, f, state);
+  Job<T>& job = call.job;
+  const int width = state_of(s);
+  job.before = grid<T>("before", std::optional<Array<T>>(before), job.batch, job.n_rows, width);
+  job.after = grid<T>("after", std::optional<Array<T>>(after), job.batch, job.n_rows, width);
+  if (tape) {
+    check_shape("tape", *tape, {call.tape});
+    job.tape = tape->data();
+  }
+  nb::gil_scoped_release unlocked;
+  const auto weight = packed<T>(s, body, weights);
+  job.packed = weight->get();
+  std::vector<Walk> walks;
+  for (const Block& b : call.blocks) walks.push_back({b.rows, b.vectors});
+  walk<T>(walks, call.stretch(), threads, body.forward_scratch(s, job.max_steps),
+          [&](int block, int begin, int end, T* scratch) {
+            body.forward(job, block, begin, end, scratch);
+          });
+}
+
+template <class T>
+void scan_backward(const Spec& s, const Bodies& named, const Const<T>& weights, const Facts<T>& f,
+                   const Const<T>& state, const Const<T>& after, std::optional<Const<T>> tape,
+                   std::optional<Const<T>> to_before, std::optional<Const<T>> to_after,
+                   Array<T> to_weights, Array<T> to_state, int threads, int group) {
+  const Body<T>& body = typed<T>(named);
+  Call<T> call = prepare<T>(s, body, f, state);
+  Job<T>& job = call.job;
+  if (group > 0) job.group = std::min(group, MAX_GROUP);
+  const int width = state_of(s);
+  job.after = grid<T>("after", std::optional<Const<T>>(after), job.batch, job.n_rows, width);
+  job.to_before = grid<T>("to_before", to_before, job.batch, job.n_rows, width);
+  job.to_after = grid<T>("to_after", to_after, job.batch, job.n_rows, width);
+  check_shape("to_weights", to_weights, {flat_size(s)});
+  check_shape("to_state", to_state, {job.batch, width});
+  check_contiguous("to_state", to_state);
+  job.to_state = to_state.data();
+  if (tape) {
+    check_shape("tape", *tape, {call.tape});
+    job.tape = const_cast<T*>(tape->data());
+  }
+  T* flat = to_weights.data();
+  nb::gil_scoped_release unlocked;
+  const auto weight = packed<T>(s, body, weights);
+  job.packed = weight->get();
+  const Buffer<T> sums(int64_t(call.slots.size()) * body.sums_size(s));
+  job.sums = sums.get();
+  const Buffer<T> carried(int64_t(call.blocks.size()) * body.carried_size(s));
+  job.carried = carried.get();
+  std::vector<Walk> walks;
+  for (const Slot& slot : call.slots) {
+    const Block& b = call.blocks[slot.first];
+    walks.push_back({b.rows, b.vectors});
+  }
+  const bool whole = call.slots.size() < call.blocks.size();
+  walk<T>(walks, whole ? int(job.n_rows) : call.stretch(), threads,
+          body.backward_scratch(s, job.max_steps, job.group),
+          [&](int slot, int begin, int end, T* scratch) {
+            const int rows = walks[slot].rows;
+            body.backward(job, slot, rows - end, rows - begin, scratch);
+          });
+  body.reduce(s, sums.get(), int(call.slots.size()), flat);
+}

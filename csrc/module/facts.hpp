@@ -1,0 +1,70 @@
+// What is known of the rows of a batch, checked: part of module.cpp.
+
+enum { GAP, UPDATE, UPDATED, VALUES, MASK, AGE, DECAY_START, DECAY_END, DELTA, LAST, QUANTITIES };
+const char* const NAMES[QUANTITIES] = {"gap", "update",      "updated",   "values", "mask",
+                                       "age", "decay_start", "decay_end", "delta",  "last"};
+
+// What is known of the rows: an array per quantity, or one table of many trajectories that has the
+// quantities side by side, and which of its trajectories are meant.
+template <class T>
+struct Facts {
+  std::vector<Maybe<T>> arrays;
+  Maybe<T> mean;
+  std::optional<Const<uint8_t>> fed;
+  std::optional<Const<int64_t>> length;
+  Maybe<T> table;  // (trajectories, rows, columns)
+  std::optional<Const<int64_t>> index;
+  std::vector<std::pair<int, int>> places;  // first column and number of columns, 0: none
+  int64_t rows = 0;
+
+  Fact<T> get(int which, int64_t batch, int units) const {
+    if (!table) return needed(NAMES[which], arrays[which], batch, rows, units);
+    const auto [first, width] = places[which];
+    if (!width) refuse(std::string(NAMES[which]) + " is missing; this scan needs it");
+    if (width != std::max(units, 1) || first < 0 || first + width > int64_t(table->shape(2)))
+      refuse(std::string(NAMES[which]) + " must have " + std::to_string(std::max(units, 1)) +
+             " columns inside the table, got columns " + std::to_string(first) + " to " +
+             std::to_string(first + width));
+    return {table->data() + first, table->stride(0), table->stride(1)};
+  }
+
+  // Checks that the table has the trajectories and rows that are asked for.
+  void check_table(int64_t batch) const {
+    check_shape("index", *index, {batch});
+    check_contiguous("index", *index);
+    const int64_t n = int64_t(table->shape(0));
+    for (int64_t i = 0; i < batch; ++i)
+      if (index->data()[i] < 0 || index->data()[i] >= n)
+        refuse("index " + std::to_string(index->data()[i]) + " is not in the table of " +
+               std::to_string(n) + " trajectories");
+    if (rows > int64_t(table->shape(1)) || (table->shape(2) > 1 && table->stride(2) != 1))
+      refuse("the table has shape " + shape_of(*table) + ", expected at least " +
+             std::to_string(rows) + " rows, and columns that lie in one piece");
+  }
+};
+
+template <class T>
+void take_rows(Job<T>& job, const Spec& s, const Facts<T>& f, int64_t batch) {
+  Rows<T>& r = job.rows;
+  r.gap = f.get(GAP, batch, -1);
+  r.update = f.get(UPDATE, batch, -1);
+  r.values = f.get(VALUES, batch, s.channels);
+  r.mask = f.get(MASK, batch, s.channels);
+  if (s.ages) r.age = f.get(AGE, batch, s.ages);
+  if (s.decay_features) {
+    r.decay_start = f.get(DECAY_START, batch, s.decay_features);
+    r.decay_end = f.get(DECAY_END, batch, s.decay_features);
+    r.updated = f.get(UPDATED, batch, -1);
+  }
+  if (s.input_decay) {
+    r.delta = f.get(DELTA, batch, s.channels);
+    r.last = f.get(LAST, batch, s.channels);
+    if (!f.mean) refuse("mean is missing; this scan needs it");
+    check_shape("mean", *f.mean, {s.channels});
+    r.mean = f.mean->data();
+  }
+  if (s.decoder.layers && f.fed) {
+    check_shape("fed", *f.fed, {f.rows});
+    r.fed = f.fed->data();
+  }
+}

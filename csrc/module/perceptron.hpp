@@ -1,0 +1,75 @@
+// A perceptron over many rows: part of module.cpp.
+
+template <class T>
+PerceptronJob<T> perceptron_job(const Perceptron& shape, const Const<T>& weights,
+                                const Const<T>& x) {
+  check_shape("weights", weights, {perceptron_flat(shape)});
+  if (x.ndim() != 2) refuse("x must have shape (rows, inputs), got " + shape_of(x));
+  check_shape("x", x, {int64_t(x.shape(0)), shape.sizes[0]});
+  PerceptronJob<T> job;
+  job.shape = &shape;
+  job.x = x.data(), job.n = int64_t(x.shape(0)), job.x_stride = x.stride(0);
+  return job;
+}
+
+template <class T>
+int64_t perceptron_tape(const Perceptron& shape, const Bodies& named, int64_t rows) {
+  const Body<T>& body = typed<T>(named);
+  const int64_t w = 2 * body.width;
+  return (rows + w - 1) / w * body.perceptron_tape_row(shape);
+}
+
+template <class T>
+void perceptron_forward(const Perceptron& shape, const Bodies& named, const Const<T>& weights,
+                        const Const<T>& x, Array<T> y, std::optional<Array<T>> tape, int threads) {
+  const Body<T>& body = typed<T>(named);
+  PerceptronJob<T> job = perceptron_job<T>(shape, weights, x);
+  check_shape("y", y, {job.n, shape.sizes[shape.layers]});
+  check_contiguous("y", y);
+  job.y = y.data();
+  if (tape) {
+    check_shape("tape", *tape, {perceptron_tape<T>(shape, named, job.n)});
+    job.tape = tape->data();
+  }
+  nb::gil_scoped_release unlocked;
+  const Buffer<T> panels(body.perceptron_packed_size(shape));
+  body.perceptron_pack(shape, weights.data(), panels.get());
+  job.packed = panels.get();
+  const int64_t w = 2 * body.width, blocks = (job.n + w - 1) / w, batch = 16;
+  spread<T>((blocks + batch - 1) / batch, threads, body.perceptron_scratch(shape),
+            [&](int64_t task, T* scratch) {
+              for (int64_t b = task * batch; b < std::min(blocks, (task + 1) * batch); ++b)
+                body.perceptron_forward(job, b, scratch);
+            });
+}
+
+template <class T>
+void perceptron_backward(const Perceptron& shape, const Bodies& named, const Const<T>& weights,
+                         const Const<T>& x, const Const<T>& tape, const Const<T>& to_y,
+                         Array<T> to_weights, std::optional<Array<T>> to_x, int threads) {
+  const Body<T>& body = typed<T>(named);
+  PerceptronJob<T> job = perceptron_job<T>(shape, weights, x);
+  check_shape("tape", tape, {perceptron_tape<T>(shape, named, job.n)});
+  check_shape("to_y", to_y, {job.n, shape.sizes[shape.layers]});
+  check_contiguous("to_y", to_y);
+  check_shape("to_weights", to_weights, {perceptron_flat(shape)});
+  if (to_x) {
+    check_shape("to_x", *to_x, {job.n, shape.sizes[0]});
+    check_contiguous("to_x", *to_x);
+    job.to_x = to_x->data();
+  }
+  job.tape = const_cast<T*>(tape.data());
+  job.to_y = to_y.data();
+  T* flat = to_weights.data();
+  nb::gil_scoped_release unlocked;
+  const Buffer<T> panels(body.perceptron_packed_size(shape));
+  body.perceptron_pack(shape, weights.data(), panels.get());
+  job.packed = panels.get();
+  const int64_t w = 2 * body.width, blocks = (job.n + w - 1) / w;
+  job.slots = int(std::clamp<int64_t>(blocks / 32, 1, 16));
+  const Buffer<T> sums(job.slots * body.perceptron_sums(shape));
+  job.sums = sums.get();
+  spread<T>(job.slots, threads, body.perceptron_scratch(shape),
+            [&](int64_t slot, T* scratch) { body.perceptron_backward(job, int(slot), scratch); });
+  body.perceptron_reduce(shape, sums.get(), job.slots, flat);
+}
