@@ -88,6 +88,31 @@ def test_the_constant_is_that_of_the_record(contents, text):
     assert inferred[0] == f"{100 * made.CONSTANT * 0.1 / 100 / 0.0369**2:.0f}{PERCENT}"
 
 
+def test_the_spread_that_the_constant_makes_is_held_against_the_inference(contents, text):
+    inferred = text.split("## What is inferred about the thesis")[1].split("\n## ")[0]
+    record, more = contents.record, []
+    for fraction, (_, printed) in zip(thesis.FRACTIONS, thesis.TEST_RMSE["ode_gru_d"], strict=True):
+        runs = record.where(experiment=2, model="ode_gru_d", fraction=fraction)
+        mse, constant, hidden = (
+            record.values(name, runs).astype(float)
+            for name in ("published_mse", "row_0_constant", "hidden_rows_0_share")
+        )
+        varying = constant * hidden / 100
+        spread = np.std(np.sqrt((mse - varying).mean() + varying), ddof=1)
+        if spread > printed:
+            more.append(f"{100 * fraction:.0f}")
+    told = inferred.split("the thesis prints for ODE-GRU-D at ")
+    assert bool(more) == (len(told) == 2)
+    if more:
+        assert re.findall(r"\d+", told[1].split(".")[0]) == more
+
+
+def test_few_repeats_are_called_few(text):
+    assert "a verdict can still change" not in text
+    few = summary(contents_of(made.synthetic(repeats=4, epochs=60), repeats=10))
+    assert "So far a model has 4 of 10 repeats at a share" in few
+
+
 def test_what_is_inferred_is_called_so_and_commands_are_there(text):
     inferred = text.split("## What is inferred about the thesis")[1].split("\n## ")[0]
     assert "self_feeding=0.5" in inferred

@@ -252,6 +252,23 @@ class Contents:
         return there, _SHARES * (len(thesis.MODELS) + len(MODELS) * self.repeats)
 
     @property
+    def caution(self) -> str:
+        """What tests of a part of the repeats can say, to follow a sentence; else nothing."""
+        there = [
+            len(self.record.where(experiment=2, model=m, fraction=f))
+            for m in MODELS
+            for f in thesis.FRACTIONS
+        ]
+        least, most = min(there), max(there)
+        if least >= self.repeats:
+            return ""
+        counted = f"{least}" if least == most else f"{least} to {most}"
+        return (
+            f" So far a model has {counted} of {self.repeats} repeats at a share: so few tell "
+            "little apart, and a verdict can still change."
+        )
+
+    @property
     def faults(self) -> tuple[str, ...]:
         """What makes numbers hard to compare, a sentence each."""
         return (

@@ -89,6 +89,7 @@ def _findings(contents: Contents) -> tuple[str, str, str]:
             f"Differences are first minus second, of the test RMSE; significance at "
             f"{thesis.ALPHA:g}. 'Not decided' means that the tests tell nothing apart, which is no "
             "proof that nothing is there; 'cannot be told yet', that runs are missing."
+            f"{contents.caution}"
         ),
         *map(page.finding, contents.findings),
     )
