@@ -20,7 +20,8 @@ class Provenance:
     """What made a run.
 
     Attributes:
-        commit: `git describe` of the checkout, `-dirty` with changes; else the package's version.
+        commit: `git describe` of the checkout, `-dirty` with changes outside `results/`; else the
+            package's version.
         bits: fingerprint of small trainings; equal where the code ends in the same numbers.
         cpu: name of the processor.
         kernel_body: which body of the scan ran.
@@ -71,7 +72,14 @@ def commit() -> str:
     # Installed into a folder of another project's checkout, that one's commit would say nothing.
     if not top or Path(top).resolve() / "src" / "offbeat" != PACKAGE.resolve():
         return f"offbeat {__version__}"
-    return git("describe", "--always", "--dirty", "--abbrev=12") or f"offbeat {__version__}"
+    described = git("describe", "--always", "--abbrev=12")
+    if not described:
+        return f"offbeat {__version__}"
+    # Runs publish under results/, which would mark the next ones as made by changed code.
+    changed = git(
+        "-C", top, "status", "--porcelain", "--untracked-files=no", "--", ".", ":(exclude)results"
+    )
+    return f"{described}-dirty" if changed else described
 
 
 def cpu() -> str:
