@@ -127,7 +127,7 @@ def test_a_csv_holds_the_numbers_of_its_table(report, record):
         for one in lines
         if one["block"] == "Ours, honest scoring"
         and one["row"] == "ODE-RNN"
-        and one["column"].startswith("30")
+        and one["column"] == "30 %"
     ]
     rows = record.where(experiment=2, model="ode_rnn", fraction=0.3)
     rmse = np.sqrt(record.values("honest_mse", rows))

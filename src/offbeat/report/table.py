@@ -89,7 +89,10 @@ class Table:
         return f"table-{self.number.lower().replace('.', '-')}"
 
     def to_csv(self) -> str:
-        """One line per cell, numbers to the last bit."""
+        """One line per cell, numbers to the last bit.
+
+        Block, row and column, by which lines are looked up, have plain spaces for thin ones.
+        """
         buffer = io.StringIO()
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(["block", "row", "column", "value", "std", "n", "bold", "mark", "text"])
@@ -99,9 +102,10 @@ class Table:
                     numbers = (_plain(cell.value), _plain(cell.spread), cell.n)
                     shown = ["" if v is None else v for v in numbers]
                     bold = "true" if cell.bold else "false"
-                    writer.writerow(
-                        [block.heading, label, column, *shown, bold, cell.mark, cell.text]
-                    )
+                    keys = [
+                        key.replace("\N{THIN SPACE}", " ") for key in (block.heading, label, column)
+                    ]
+                    writer.writerow([*keys, *shown, bold, cell.mark, cell.text])
         return buffer.getvalue()
 
     def to_markdown(self) -> str:
