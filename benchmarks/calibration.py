@@ -30,8 +30,8 @@ def protocol_data(
     """Training, validation and test part, and the scaler measured on everything."""
     recorded = ob.simulate("hopper", n_trajectories, 200, seed=123)
     scaler = ob.Scaler.fit("divide_by_max", recorded)
-    thinned = ob.thin(ob.windows(recorded, 100, seed=seed), observed_fraction, seed=seed)
-    train, validation, test = ob.split(thinned, seed=seed)
+    masked = ob.mask_out(ob.windows(recorded, 100, seed=seed), observed_fraction, seed=seed)
+    train, validation, test = ob.split(masked, seed=seed)
     return train, validation, test, scaler
 
 
@@ -65,7 +65,7 @@ def run(
     )
     thesis = model in ob.THESIS_MODELS
     config = ob.thesis_config(model, clock=clock) if thesis else ob.ModelConfig(name=model)
-    made = ob.make(config, train, scaler=scaler, seed=seed)
+    made = ob.make_model(config, train, scaler=scaler, seed=seed)
     name = f"{model}-{round(100 * observed_fraction)}-{epochs}"
     if thesis and clock != "first_row":
         name += f"-{clock}"
@@ -129,13 +129,13 @@ def table(folder: Path) -> None:
         result = json.loads(path.read_text(encoding="utf-8"))
         predictors = result["scores"]["predictors"]
         ours, trivial = predictors[result["model"]], predictors["last_value"]
-        honest = ours["honest"]
+        honest = ours["after_first_observation"]
         share = round(100 * result["observed_fraction"])
         cells = (
             f"{path.stem}: {result['model']}, {share} %, {result['epochs']} epochs",
             f"{honest['mse']:.6f} ({honest['rmse']:.4f})",
-            f"{ours['honest_hidden']['rmse']:.4f}",
-            f"{ours['rows_1_99']['mse']:.5f}",
+            f"{ours['masked']['rmse']:.4f}",
+            f"{ours['after_first_row']['mse']:.5f}",
             f"{ours['published']['rmse']:.4f}",
             f"{trivial['honest']['rmse']:.4f}",
             f"{honest['rmse'] / trivial['honest']['rmse']:.3f}",

@@ -1,10 +1,10 @@
-"""How far the scores of a self-fed model move with its coins alone: same weights, same test part.
+"""How far the scores of a self-fed model move with its generator alone: same weights, same test part.
 
     offbeat reproduce --out runs/thesis --only experiment=1,model=gru,fraction=0.3
-    python benchmarks/coins.py runs/thesis e1-gru-30-r00 --out results/benchmarks/coins.json
+    python benchmarks/generator.py runs/thesis e1-gru-30-r00 --out results/benchmarks/generator.json
 
 Self-feeding draws one coin per row for the whole part that is scored, so a score is of one sequence
-of 100 coins, however many trajectories there are.
+of 100 generator, however many trajectories there are.
 """
 
 from __future__ import annotations
@@ -17,35 +17,36 @@ import torch
 from common import kept, machine, write
 
 import offbeat as ob
-from offbeat.experiment.protocol import Protocol
+from thesis.protocol import Protocol
 
 
 def main() -> None:
-    """Scores the run's model with coins of many seeds."""
+    """Scores the run's model with generator of many seeds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="of a reproduction, with its checkpoints")
     parser.add_argument("run_id")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/coins.json"))
+    parser.add_argument("--out", type=Path, default=Path("results/benchmarks/generator.json"))
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
 
     protocol = Protocol()
     (run,) = (run for run in protocol.runs() if run.run_id == arguments.run_id)
     _, _, test = protocol.cut(ob.load(arguments.folder / "data" / "recorded.parquet"), run)
-    model = ob.load_checkpoint(arguments.folder / "runs" / run.run_id / "training" / "model")
+    model = ob.load_model(arguments.folder / "runs" / run.run_id / "training" / "model")
     scores = [
         ob.evaluate({"m": model}, test, seed=seed).scores["m"] for seed in range(arguments.seeds)
     ]
     found = {
-        name: [getattr(score, name).rmse for score in scores] for name in ("published", "honest")
+        name: [getattr(score, name).rmse for score in scores]
+        for name in ("published", "after_first_observation")
     }
     runs = {**(kept(arguments.out, "runs") or {}), run.run_id: found}
     write(str(arguments.out), {"machine": machine(), "runs": runs})
     for name, values in found.items():
         print(
-            f"{run.run_id}  {name} RMSE, coins of {len(values)} seeds: mean {np.mean(values):.4f}"
+            f"{run.run_id}  {name} RMSE, generator of {len(values)} seeds: mean {np.mean(values):.4f}"
             f"  std {np.std(values, ddof=1):.4f}  from {min(values):.4f} to {max(values):.4f}"
         )
         for other in runs:

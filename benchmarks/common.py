@@ -14,7 +14,7 @@ import torch
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.experiment.provenance import commit, cpu
+from thesis.provenance import commit, cpu
 
 
 def synthetic(
@@ -39,7 +39,7 @@ def machine() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "torch_threads": torch.get_num_threads(),
-        "scan_body": kernels.body()[0],
+        "scan_backend": kernels.backend()[0],
         "python": platform.python_version(),
         "commit": commit(),
     }

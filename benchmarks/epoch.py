@@ -16,7 +16,7 @@ from common import machine, synthetic, write
 
 import offbeat as ob
 from offbeat import training
-from offbeat.kernels import fused
+from offbeat.kernels import cpu
 
 CALLS = ("scan_forward", "scan_backward", "perceptron_forward", "perceptron_backward")
 
@@ -48,9 +48,9 @@ def measure(name: str, data: ob.Dataset, validation: ob.Dataset, epochs: int) ->
     time.
     """
     config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
-    model = ob.make(config, data, seed=0)
+    model = ob.make_model(config, data, seed=0)
     options = ob.train_config(name, epochs=epochs)
-    timed = Timed(fused.compiled)
+    timed = Timed(cpu.compiled)
     ends: list[dict[str, float]] = []
     close = training._close_epoch
 
@@ -58,12 +58,12 @@ def measure(name: str, data: ob.Dataset, validation: ob.Dataset, epochs: int) ->
         close(*arguments)
         ends.append({"wall": time.perf_counter(), **timed.seconds})
 
-    fused.compiled, training._close_epoch = timed, closed
+    cpu.compiled, training._close_epoch = timed, closed
     began = time.perf_counter()
     try:
         ob.fit(model, data, validation, options, progress=False)
     finally:
-        fused.compiled, training._close_epoch = timed.module, close
+        cpu.compiled, training._close_epoch = timed.module, close
     spent = [{k: b[k] - a[k] for k in a} for a, b in itertools.pairwise(ends)]
     each = {key: statistics.median(epoch[key] for epoch in spent) for key in spent[0]}
     shares = [sum(epoch[call] for call in CALLS) / epoch["wall"] for epoch in spent]

@@ -5,7 +5,7 @@
 Experiment 2 of the protocol at one observed fraction and one repeat: the windows, hidden rows,
 split, order of batches and initial weights of the record's fair GRU, without self-feeding. Only the
 rows at which the cell acts, its age input and the unit of that differ from variant to variant
-(`update_rows`, `age_input` and `age_unit` of `ModelConfig`). A variant whose result is in the file
+(`update_rows`, `time_input` and `time_input_unit` of `ModelConfig`). A variant whose result is in the file
 already is not trained again.
 """
 
@@ -22,17 +22,17 @@ from common import kept, machine, write
 
 import offbeat as ob
 from offbeat.evaluation import LAST_VALUE
-from offbeat.experiment.protocol import Protocol, Run
+from thesis.protocol import Protocol, Run
 
 VARIANTS = (
-    {"update_rows": "observed", "age_input": "none", "age_unit": "gap"},
-    {"update_rows": "observed", "age_input": "gap", "age_unit": "gap"},  # `gru_unfed`
-    {"update_rows": "observed", "age_input": "delta", "age_unit": "gap"},
-    {"update_rows": "observed", "age_input": "delta", "age_unit": "longest"},
-    {"update_rows": "every", "age_input": "none", "age_unit": "gap"},
-    {"update_rows": "every", "age_input": "elapsed", "age_unit": "gap"},
-    {"update_rows": "every", "age_input": "delta", "age_unit": "gap"},
-    {"update_rows": "every", "age_input": "delta", "age_unit": "longest"},  # `gru_fair`
+    {"update_rows": "observed", "time_input": "none", "time_input_unit": "gap"},
+    {"update_rows": "observed", "time_input": "gap", "time_input_unit": "gap"},  # `gru_unfed`
+    {"update_rows": "observed", "time_input": "delta", "time_input_unit": "gap"},
+    {"update_rows": "observed", "time_input": "delta", "time_input_unit": "longest"},
+    {"update_rows": "every", "time_input": "none", "time_input_unit": "gap"},
+    {"update_rows": "every", "time_input": "elapsed", "time_input_unit": "gap"},
+    {"update_rows": "every", "time_input": "delta", "time_input_unit": "gap"},
+    {"update_rows": "every", "time_input": "delta", "time_input_unit": "longest"},  # `gru_fair`
 )
 
 
@@ -46,7 +46,7 @@ def trained(
     """Trains one variant and scores it."""
     train, validation, test = parts
     config = replace(protocol.model_config(run.model), **variant)
-    model = ob.make(config, train, scaler=scaler, seed=run.seed_weights)
+    model = ob.make_model(config, train, scaler=scaler, seed=run.seed_weights)
     started = time.perf_counter()
     fitted = ob.fit(model, train, validation, protocol.train_config(run), progress=False)
     scores = ob.evaluate({"gru": model}, test, seed=run.seed_draw).scores
@@ -54,9 +54,9 @@ def trained(
         **variant,
         "epochs": run.epochs,
         "published_rmse": scores["gru"].published.rmse,
-        "honest_rmse": scores["gru"].honest.rmse,
-        "last_value_honest_rmse": scores[LAST_VALUE].honest.rmse,
-        "validation_honest_mse": [record.validation_honest_mse for record in fitted.history],
+        "after_first_observation_rmse": scores["gru"].after_first_observation.rmse,
+        "last_value_honest_rmse": scores[LAST_VALUE].after_first_observation.rmse,
+        "validation_mse": [record.validation_mse for record in fitted.history],
         "seconds": time.perf_counter() - started,
     }
 
@@ -93,9 +93,9 @@ def main() -> None:
     for row in done:
         print(
             f"{row['fraction']:.0%} repeat {row['repeat']}  update {row['update_rows']:8}"
-            f"  age {row['age_input']:8} in {row['age_unit']:8}"
+            f"  age {row['time_input']:8} in {row['time_input_unit']:8}"
             f"  published {row['published_rmse']:.4f}"
-            f"  honest {row['honest_rmse']:.4f}  last value {row['last_value_honest_rmse']:.4f}"
+            f"  honest {row['after_first_observation_rmse']:.4f}  last value {row['last_value_honest_rmse']:.4f}"
         )
 
 

@@ -1,6 +1,6 @@
 """The models of the benchmark once more, as their users write them: eager PyTorch, and JAX.
 
-Both take the weights and the facts of the rows of our own model, so that every contestant computes
+Both take the weights and the step inputs of our own model, so that every contestant computes
 the same loss (`training_step.py` checks that it does). Each does what a careful user of the library
 would: input projections, decays and x-hat for all rows at once, then a loop over rows.
 """
@@ -13,15 +13,15 @@ from typing import Any
 import torch
 
 import offbeat as ob
-from offbeat.kernels import ScanRows
+from offbeat.kernels import StepInputs
 
 
-def weights_of(model: ob.RecurrentModel) -> dict[str, torch.Tensor]:
+def weights_of(model: ob.Model) -> dict[str, torch.Tensor]:
     """Copies of a model's weights, by name."""
     return {name: p.detach().clone() for name, p in model.named_parameters()}
 
 
-def facts_of(rows: ScanRows, targets: torch.Tensor) -> dict[str, torch.Tensor]:
+def facts_of(rows: StepInputs, targets: torch.Tensor) -> dict[str, torch.Tensor]:
     """Facts with rows first, as a loop wants them."""
     names = ("gap", "update", "values", "mask", "age", "decay_end", "last")
     facts = {"targets": targets.transpose(0, 1).contiguous()}
@@ -97,7 +97,7 @@ def loss(xp: Any, model: SimpleNamespace, p: dict[str, Any], f: dict[str, Any]) 
     return ((predictions - f["targets"][1:]) ** 2).mean()
 
 
-def shape_of(model: ob.RecurrentModel) -> SimpleNamespace:
+def shape_of(model: ob.Model) -> SimpleNamespace:
     """What `loss` must know of a model."""
     return SimpleNamespace(
         channels=model.channels,
@@ -150,7 +150,7 @@ def torch_library(*, torchdiffeq: bool) -> SimpleNamespace:
 class TorchContestant:
     """A training step of eager PyTorch with its own Adamax."""
 
-    def __init__(self, model: ob.RecurrentModel, facts: dict[str, torch.Tensor]) -> None:
+    def __init__(self, model: ob.Model, facts: dict[str, torch.Tensor]) -> None:
         self.weights = {k: v.requires_grad_() for k, v in weights_of(model).items()}
         self.shape, self.facts = shape_of(model), facts
         self.xp = torch_library(torchdiffeq=bool(model.spec.field))
@@ -168,7 +168,7 @@ class TorchContestant:
 class JaxContestant:
     """A training step of JAX: one jitted function, a `lax.scan` over rows, Adamax inside."""
 
-    def __init__(self, model: ob.RecurrentModel, facts: dict[str, torch.Tensor]) -> None:
+    def __init__(self, model: ob.Model, facts: dict[str, torch.Tensor]) -> None:
         import jax
         from jax import lax
         from jax import numpy as jnp

@@ -27,7 +27,7 @@ import pyarrow.csv as pv
 import pyarrow.parquet as pq
 
 from offbeat.data.readers import read
-from offbeat.experiment.provenance import commit, cpu
+from thesis.provenance import commit, cpu
 
 
 def write(folder: Path, rows: int, channels: int) -> dict[str, Path]:

@@ -20,7 +20,7 @@ from common import kept, machine, write
 
 import offbeat as ob
 from offbeat.evaluation import LAST_VALUE
-from offbeat.experiment.protocol import Protocol
+from thesis.protocol import Protocol
 
 
 def measured(protocol: Protocol) -> dict[str, Any]:
@@ -32,13 +32,14 @@ def measured(protocol: Protocol) -> dict[str, Any]:
         if (run.experiment, run.model, run.repeat) != (2, "gru", 0):
             continue
         train, _, test = protocol.cut(recorded, run)
-        model = ob.make(protocol.model_config("gru"), train, scaler=scaler, seed=0)
+        model = ob.make_model(protocol.model_config("gru"), train, scaler=scaler, seed=0)
         if "c" not in found:
             rows = np.stack([scaler.scaled(t.values[:1])[0] for t in (*train, *test)])
             found["c"] = float((rows**2).mean())
         scores = ob.evaluate({"gru": model}, test, seed=0).scores[LAST_VALUE]
         found["last_value"][str(run.observed_fraction)] = {
-            name: getattr(scores, name).rmse for name in ("published", "rows_1_99", "honest")
+            name: getattr(scores, name).rmse
+            for name in ("published", "after_first_row", "after_first_observation")
         }
     return found
 

@@ -20,7 +20,7 @@ import torch
 from common import machine, synthetic, write
 
 import offbeat as ob
-from offbeat.kernels import fused
+from offbeat.kernels import cpu as fused
 from offbeat.training import Examples, threads_for
 
 BASE: dict[str, Any] = {"batch": 50, "rows": 100, "hidden": 15, "units": 100, "observed": 0.3}
@@ -45,7 +45,7 @@ def ragged(n: int, rows: int, seed: int = 0) -> ob.Dataset:
 
 def step_of(data: ob.Dataset, name: str, **options: Any) -> Callable[[], None]:
     """Loss and its gradient for a whole data set as one batch."""
-    model = ob.make(ob.thesis_config(name, **options), data, seed=0)
+    model = ob.make_model(ob.thesis_config(name, **options), data, seed=0)
     examples = Examples(model, model.batch(data))
     index = torch.arange(len(examples))
 
@@ -79,7 +79,7 @@ def in_turn(steps: dict[Any, Callable[[], None]], repeats: int) -> dict[Any, flo
 
 
 def under(step: Callable[[], None], **settings: int) -> Callable[[], None]:
-    """The same step under other settings of the fused body: `TAPE_LIMIT`, `ROWS_AT_ONCE`."""
+    """The same step under other settings of the compiled backend: `TAPE_LIMIT`, `ROWS_AT_ONCE`."""
 
     def changed() -> None:
         kept = {name: getattr(fused, name) for name in settings}

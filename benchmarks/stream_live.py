@@ -25,7 +25,7 @@ import torch
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.inference.live import LiveStream
+from offbeat.stream.live import LiveStream
 
 MODELS = ("gru", "gru_d", "ode_rnn", "ode_gru_d", "anchored_ode_gru_d")
 CHANNELS = 14
@@ -36,7 +36,9 @@ def training_part(seed: int = 0) -> ob.Dataset:
     """Random walks on a 5 ms grid: what scales and gaps are measured on."""
     random = np.random.default_rng(seed)
     walks = random.normal(size=(20, 100, CHANNELS)).cumsum(axis=1)
-    return ob.thin(ob.Dataset(tuple(ob.Trajectory(0.005 * np.arange(100), w) for w in walks)), 0.3)
+    return ob.mask_out(
+        ob.Dataset(tuple(ob.Trajectory(0.005 * np.arange(100), w) for w in walks)), 0.3
+    )
 
 
 def messages(count: int, seed: int = 1) -> tuple[Any, Any]:
@@ -86,7 +88,7 @@ def measure(stream: LiveStream, steps: int) -> dict[str, Any]:
 
 def engines(name: str, folder: str) -> dict[str, Callable[[], LiveStream]]:
     """How to make a stream of each kind."""
-    model = ob.make(name, training_part())
+    model = ob.make_model(name, training_part())
     path = Path(folder) / f"{name}.onnx"
 
     def onnx() -> LiveStream:
@@ -105,7 +107,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    results: dict[str, Any] = {"body": kernels.body()[0], "steps": options.steps, "models": {}}
+    results: dict[str, Any] = {"body": kernels.backend()[0], "steps": options.steps, "models": {}}
     with tempfile.TemporaryDirectory() as folder:
         for name in options.models:
             made = engines(name, folder)
@@ -115,7 +117,7 @@ def main() -> None:
     if options.json:
         print(json.dumps(results, indent=2))
         return
-    print(f"{options.steps} steps; scan body: {results['body']}\n")
+    print(f"{options.steps} steps; scan backend: {results['body']}\n")
     print(
         "| model | engine | observe, median | 99.9 % | predict, median | 99.9 % | "
         "resident MiB, start | end |"

@@ -19,7 +19,7 @@ import torch
 from common import machine, synthetic, write
 
 import offbeat as ob
-from offbeat.inference.fused_engine import FusedEngine
+from offbeat.stream.cpu_engine import CpuEngine
 
 MODELS = ("gru", "gru_d", "ode_rnn", "ode_gru_d", "anchored_ode_gru_d")
 
@@ -37,7 +37,7 @@ def spread(nanoseconds: np.ndarray) -> dict[str, float]:
 
 def measure(name: str, data: ob.Dataset, steps: int) -> dict[str, Any]:
     """Latencies of one model."""
-    model = ob.make(name, data, seed=0)
+    model = ob.make_model(name, data, seed=0)
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(1000, model.channels))
     rows[rng.random(1000) < 0.7] = np.nan  # 30 % of the rows bring something
@@ -58,8 +58,8 @@ def measure(name: str, data: ob.Dataset, steps: int) -> dict[str, Any]:
                 taken[i] = clock() - start
         result[level] = spread(taken)
 
-    if model.runs_fused():
-        live = FusedEngine(model)._live
+    if model.runs_compiled():
+        live = CpuEngine(model)._live
         mask = ~np.isnan(rows)
         values = np.where(mask, rows, 0).astype(np.float32)
         t = 0.0

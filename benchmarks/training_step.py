@@ -22,7 +22,7 @@ from peers import JaxContestant, TorchContestant, facts_of
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.run_state import RunState, flat_parameters
+from offbeat.run import RunState, flat_parameters
 from offbeat.training import Examples, threads_for, train_step
 
 MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
@@ -37,7 +37,7 @@ class Contestant(NamedTuple):
 
 def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Contestant:
     """A training step of this library in one of its bodies."""
-    model = ob.make(config, data, seed=0)
+    model = ob.make_model(config, data, seed=0)
     examples = Examples(model, model.batch(data))
     training = ob.TrainConfig()
     state = RunState(flat_parameters(model).__enter__(), training)
@@ -58,12 +58,12 @@ def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Contestant:
 def contestants(name: str, data: ob.Dataset) -> dict[str, Contestant]:
     """Everyone who can run a model here."""
     config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
-    model = ob.make(config, data, seed=0)
+    model = ob.make_model(config, data, seed=0)
     batch = model.batch(data)
-    rows, _ = model.facts(batch)
+    rows, _ = model.step_inputs(batch)
     facts = facts_of(rows, batch.values)
     found: dict[str, Contestant] = {}
-    if kernels.fused.bodies():
+    if kernels.cpu.instruction_sets():
         found["ours, fused"] = ours(config, data, "fused")
     found["ours, reference"] = ours(config, data, "reference")
     found["eager torchdiffeq" if model.spec.field else "eager torch"] = Contestant(

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 
 import offbeat as ob
+from offbeat.answers.scoring import ChannelScores, training_mean
+from offbeat.baselines import fill
 from offbeat.data.inspection import inspect
 from offbeat.files import write_json
-from offbeat.inference.scoring import ChannelScores, training_mean
-from offbeat.inference.trivial import fill
-from offbeat.report.answers import answers
-from offbeat.report.figures import save
+from offbeat.plots.answers import answers
+from offbeat.plots.figures import save
 
 ROOT = Path(__file__).resolve().parents[1]
 MODEL = "anchored_ode_gru_d"
@@ -80,7 +80,7 @@ def data_folder() -> Path:
 
 def silenced(log: Log, dataset: ob.Dataset, *, seed: int = 0) -> ob.Dataset:
     """Hides 30 % of each sensor in silences of its own: what is to be filled in."""
-    return ob.thin(
+    return ob.mask_out(
         dataset,
         0.7,
         hide="dropout",
@@ -99,7 +99,7 @@ def views(log: Log, dataset: ob.Dataset, seed: int) -> tuple[ob.Dataset, ob.Data
     return (
         dataset,
         silenced(log, dataset, seed=seed),
-        ob.thin(dataset, 0.6, hide="bursts", burst_s=log.horizons_s[-1] / 2, seed=seed),
+        ob.mask_out(dataset, 0.6, hide="bursts", burst_s=log.horizons_s[-1] / 2, seed=seed),
     )
 
 
@@ -155,8 +155,8 @@ def run(log: Log, out: Path, figures: Path) -> dict[str, Any]:
         view.take(np.arange(i, len(windows), 3))
         for i, view in enumerate(views(log, windows, seed=2))
     )
-    held_out = ob.windows(log.validation, log.window, cut="consecutive")
-    validation = together(views(log, held_out, seed=3))
+    validation_set = ob.windows(log.validation, log.window, cut="consecutive")
+    validation = together(views(log, validation_set, seed=3))
     print(
         f"{log.name}: {len(train)} training windows of {sum(t.rows for t in train)} rows, "
         f"{len(validation)} validation windows of {sum(t.rows for t in validation)} rows"
@@ -229,17 +229,17 @@ def trained(
                 keep="best",
             )
 
-        def fresh() -> ob.RecurrentModel:
-            return ob.make(MODEL, train, field_units=(64, 64), seed=0)
+        def fresh() -> ob.Model:
+            return ob.make_model(MODEL, train, field_units=(64, 64), seed=0)
 
         for rate in RATES:
             folder = Path(kept) / f"{rate:g}"
             fitted = ob.fit(fresh(), train, validation, config(rate), out=folder, progress=False)
-            best = min(fitted.history, key=lambda r: r.validation_honest_mse)
+            best = min(fitted.history, key=lambda r: r.validation_mse)
             tried.append(
                 {
                     "learning_rate": rate,
-                    "validation_mse": best.validation_honest_mse,
+                    "validation_mse": best.validation_mse,
                     "epoch": best.epoch,
                 }
             )
@@ -259,7 +259,7 @@ def scores(log: Log, pair: ob.TwoSided, test: ob.Dataset) -> dict[str, Any]:
     show(log, one)
     filled = ob.score_imputation(pair, silenced(log, test, seed=4))
     show(log, filled.scores, filled.verdict())
-    ahead = ob.score_extrapolation(pair.forward, test, log.horizons_s, targets=12)
+    ahead = ob.score_forecast(pair.forward, test, log.horizons_s, targets=12)
     for each in ahead:
         show(log, each)
     return {

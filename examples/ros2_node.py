@@ -7,7 +7,7 @@ It subscribes to `joint_states` and publishes a `JointState` on `predicted_joint
 message: the joints as they will be `horizon_s` after the newest stamp, from all that was received.
 A joint that a message leaves out was not measured; messages of one stamp are one row, so several
 drivers may publish on the topic. Late messages are put where they belong, and stamps that jump
-(a simulation that starts again) begin anew, as `offbeat.StreamPolicies` tells. What was counted is
+(a simulation that starts again) begin anew, as `offbeat.StreamOptions` tells. What was counted is
 logged every ten seconds.
 
 Besides Offbeat it needs a sourced ROS 2 (rclpy, sensor_msgs). The model may be the folder of a run
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat import OffbeatError
-from offbeat.inference.live import LiveStream
+from offbeat.stream.live import LiveStream
 
 FIELDS = ("position", "velocity", "effort")
 """Of a JointState, each with one number per joint, or none at all."""
@@ -128,10 +128,10 @@ def load(model: str) -> LiveStream:
         return OnnxStream(model, **policies)
     import torch
 
-    from offbeat import Stream, load_checkpoint
+    from offbeat import Stream, load_model
 
     torch.set_num_threads(1)
-    return Stream(load_checkpoint(model), **policies)
+    return Stream(load_model(model), **policies)
 
 
 def main() -> None:

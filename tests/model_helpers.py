@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from offbeat import Batch, Dataset, ModelConfig, RecurrentModel, Trajectory, make
+from offbeat import Batch, Dataset, Model, ModelConfig, Trajectory
+from offbeat.models.zoo import make_model
 
 SMALL: dict[str, Any] = {
     "hidden_size": 4,
@@ -49,7 +50,7 @@ def with_observed(one: Trajectory, observed: Any) -> Trajectory:
     return Trajectory(one.times, one.values, observed=mask, names=one.names, units=one.units)
 
 
-def draw_weights(model: RecurrentModel, *, seed: int = 1, std: float = 0.4) -> RecurrentModel:
+def draw_weights(model: Model, *, seed: int = 1, std: float = 0.4) -> Model:
     """Draws every parameter, biases too: initial weights are so small that they hide faults."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -67,16 +68,16 @@ def small_model(
     seed: int = 1,
     std: float = 0.4,
     **options: Any,
-) -> RecurrentModel:
+) -> Model:
     """A model of a few units whose every parameter is drawn from N(0, std^2)."""
     chosen = dict(SMALL)
     if isinstance(name, ModelConfig):
         chosen = {k: v for k, v in SMALL.items() if getattr(name, k) is None}
-    model = make(name, train or dataset(6, seed=9), **{**chosen, **options})
+    model = make_model(name, train or dataset(6, seed=9), **{**chosen, **options})
     return draw_weights(model.to(dtype), seed=seed, std=std)
 
 
-def with_growing_decays(model: RecurrentModel) -> RecurrentModel:
+def with_growing_decays(model: Model) -> Model:
     """Decays that grow with age, as at the start of training: below 0 they get no gradient."""
     with torch.no_grad():
         for part in (model.decay, model.input_decay):
@@ -85,7 +86,7 @@ def with_growing_decays(model: RecurrentModel) -> RecurrentModel:
     return model
 
 
-def predictions(model: RecurrentModel, batch: Batch, **options: Any) -> Tensor:
+def predictions(model: Model, batch: Batch, **options: Any) -> Tensor:
     """(batch, rows, channels) without a graph, 0 at padding."""
     with torch.no_grad():
         return model(batch, **options).predictions * batch.valid[..., None]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from offbeat.kernels import ScanRows, ScanSpec, ScanWeights
+from offbeat.kernels import ScanSpec, ScanWeights, StepInputs
 
 CELLS: dict[str, dict[str, Any]] = {
     "none": {"cell": "none"},
@@ -37,7 +37,7 @@ class Problem(NamedTuple):
 
     spec: ScanSpec
     weights: ScanWeights
-    rows: ScanRows
+    rows: StepInputs
     state: Tensor
     factors: tuple[Tensor, Tensor]
 
@@ -55,7 +55,7 @@ class Problem(NamedTuple):
         facts = {f.name: cast(getattr(self.rows, f.name)) for f in fields(self.rows)}
         return self._replace(
             weights=self.with_weights(tensors),
-            rows=ScanRows(**facts),
+            rows=StepInputs(**facts),
             state=self.state.detach().double().requires_grad_(),
             factors=(self.factors[0].double(), self.factors[1].double()),
         )
@@ -153,7 +153,7 @@ def problem(
     length = None
     if padded:
         length = torch.randint(1, rows + 1, (batch,), generator=generator)
-    facts = ScanRows(
+    facts = StepInputs(
         gap=gap,
         update=update,
         values=normal(batch, rows, channels, by=1.0) * mask,

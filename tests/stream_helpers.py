@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from offbeat import Dataset, RecurrentModel, Scaler, StreamPolicies, Trajectory
-from offbeat.inference.engine import Engine
-from offbeat.inference.live import Frame, LiveStream
+from offbeat import Dataset, Model, Scaler, StreamOptions, Trajectory
+from offbeat.stream.engine import Engine
+from offbeat.stream.live import Frame, LiveStream
 
 NAMES = ("a", "b", "c")
 
@@ -66,7 +66,7 @@ class Recorded(LiveStream):
         self.recorder = Recorder()
         frame = Frame(NAMES, ("m",) * 3, Scaler.identity(3), median_gap=0.1, elapsed_limit=2.0)
         super().__init__(
-            self.recorder, frame, policies=StreamPolicies(**policies), time_unit=time_unit
+            self.recorder, frame, policies=StreamOptions(**policies), time_unit=time_unit
         )
 
     @property
@@ -86,7 +86,7 @@ def message(one: Trajectory, row: int) -> dict[str, float]:
     return {name: value for name, value, seen in cells if seen}
 
 
-def batch_predictions(model: RecurrentModel, one: Trajectory) -> Any:
+def batch_predictions(model: Model, one: Trajectory) -> Any:
     """(rows, channels) by the batch pass, in original units."""
     import torch
 

@@ -1,4 +1,4 @@
-"""Ages and gaps at every row against a plain loop, split anywhere, with empty rows anywhere."""
+"""ElapsedTimes and gaps at every row against a plain loop, split anywhere, with empty rows anywhere."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from model_helpers import TICK
 from numpy.typing import NDArray
 
 from offbeat import Batch, Trajectory
-from offbeat.models.ages import Ages, Carry, ages
+from offbeat.models.elapsed import ElapsedTimes, RecurrentState, ages
 
 FAR = 1e6
-NAMES = [field.name for field in fields(Ages)]
+NAMES = [field.name for field in fields(ElapsedTimes)]
 MEAN = torch.tensor([50.0, 60.0, 70.0], dtype=torch.float64)
 
 
@@ -50,11 +50,13 @@ def cases(draw: st.DrawFn) -> Case:
     return Case(made, limit, random, draw(st.booleans()))
 
 
-def empty(batch: Batch) -> Carry:
-    return Carry.empty(torch.zeros(len(batch), 1, dtype=torch.float64), MEAN)
+def empty(batch: Batch) -> RecurrentState:
+    return RecurrentState.empty(torch.zeros(len(batch), 1, dtype=torch.float64), MEAN)
 
 
-def measured(case: Case, batch: Batch, carry: Carry | None = None) -> tuple[Ages, Carry]:
+def measured(
+    case: Case, batch: Batch, carry: RecurrentState | None = None
+) -> tuple[ElapsedTimes, RecurrentState]:
     carry = carry or empty(batch)
     return ages(batch, carry, elapsed_limit=case.limit, from_first_row=case.from_first_row)
 

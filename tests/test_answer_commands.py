@@ -14,14 +14,14 @@ import yaml
 from test_cli import one_line_error
 
 import offbeat as ob
-from offbeat.cli import main
-from offbeat.commands.common import answer_columns, plain
-from offbeat.report.answers import answers
+from offbeat.cli.app import main
+from offbeat.cli.common import answer_columns, plain
+from offbeat.plots.answers import answers
 
 NAMES = ("gyro", "tilt", "height")
 PARTS = [
-    "--parts.split=in_time", "--parts.window_s=0.4", "--parts.hide=bursts",
-    "--parts.burst_s=0.05", "--parts.observed_fraction=0.7",
+    "--split.split=in_time", "--split.window_s=0.4", "--split.hide=bursts",
+    "--split.burst_s=0.05", "--split.observed_fraction=0.7",
 ]  # fmt: skip
 MODEL = ["--model.hidden_size=4", "--model.field_units=[6]", "--training.epochs=1"]
 
@@ -59,7 +59,7 @@ def table(path) -> list[dict[str, str]]:
 
 def test_a_two_sided_run_holds_both_models_and_says_who_wins(run):
     inside = {path.name for path in run.iterdir()}
-    assert {"model", "backward", "two_sided.json", "reader.json", "parts.json"} <= inside
+    assert {"model", "backward", "two_sided.json", "reader.json", "split.json"} <= inside
     results = json.loads((run / "results.json").read_text())
     filled = results["imputation"]["rmse_in_units"]
     assert set(filled) == {"causal", "two_sided", "last_value", "linear", "pchip"}
@@ -115,13 +115,13 @@ def test_impute_writes_the_same_table_as_parquet(run, log, tmp_path):
 
 def test_extrapolate_answers_after_the_last_row_on_the_clock_of_the_log(run, log, tmp_path):
     out = tmp_path / "ahead.csv"
-    assert main(["extrapolate", str(run), str(log), str(out), "--horizons=[0.05, 0.2]"]) == 0
+    assert main(["forecast", str(run), str(log), str(out), "--horizons=[0.05, 0.2]"]) == 0
     lines = table(out)
     assert [float(line["horizon"]) for line in lines] == [0.05, 0.2]
     assert [int(line["clock_ms"]) for line in lines] == [1000 + 3990 + 50, 1000 + 3990 + 200]
     assert {line[f"{name}|observed"] for line in lines for name in NAMES} == {"false"}
     data = ob.read(log, time_column="stamp", time_unit="ms")
-    expected = ob.extrapolate(ob.load_checkpoint(run), data, [0.05, 0.2])[0].values
+    expected = ob.forecast(ob.load_model(run), data, [0.05, 0.2])[0].values
     assert np.array_equal([[float(line[name]) for name in NAMES] for line in lines], expected)
 
 
@@ -156,7 +156,7 @@ def test_other_data_is_hidden_in_any_way_and_scored_as_a_whole(run, log, tmp_pat
     said = json.loads(capsys.readouterr().out)
     assert said["part"] == "all"
     data = ob.read(other, time_column="stamp", time_unit="ms")
-    hidden = ob.thin(data, 0.6, hide="cells")[0]
+    hidden = ob.mask_out(data, 0.6, hide="cells")[0]
     expected = (data[0].observed & ~hidden.observed).sum(axis=0).tolist()
     assert list(said["imputation"]["cells"].values()) == expected
 
@@ -168,7 +168,7 @@ def test_figures_are_written_on_request(run, log, tmp_path):
     table_of = str(tmp_path / "a.csv")
     for arguments in (
         ["impute", str(run), str(log), table_of, f"--figure={paths[0]}", "--channels=[tilt]"],
-        ["extrapolate", str(run), str(log), table_of, "--horizons=[0.1, 0.2]",
+        ["forecast", str(run), str(log), table_of, "--horizons=[0.1, 0.2]",
          f"--figure={paths[1]}"],
         ["evaluate", str(run), str(log), f"--figure={paths[2]}", "--trajectory=0"],
     ):  # fmt: skip
@@ -226,11 +226,11 @@ def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
         (["impute", run, log, out, "--trajectory=1"], "there is no trajectory 1"),
         (["impute", run, log, out, "--reader.time_col=stamp"], "did you mean 'time_column'"),
         (["impute", run, log, out, "--reader.format=cvs"], "did you mean 'csv'"),
-        (["extrapolate", run, log, out], "horizons"),
-        (["extrapolate", run, log, out, "--horizons=0"], "above 0"),
+        (["forecast", run, log, out], "horizons"),
+        (["forecast", run, log, out, "--horizons=0"], "above 0"),
         (["evaluate", run, log, "--hide=burst"], "did you mean 'bursts'"),
         (["evaluate", run, log, "--horizons=1000"], "use shorter horizons"),
-        (["train", log, out.parent, *READER, "--parts.hide=cell"], "hide"),
+        (["train", log, out.parent, *READER, "--split.hide=cell"], "hide"),
         (["train", log, out.parent, *READER], "split='in_time'"),
         (["predict", run, log, out, "--reader.delimiter=;;"], "delimiter"),
     ):
@@ -238,12 +238,12 @@ def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
     assert not out.parent.exists(), "bad input writes nothing"
 
 
-def test_a_thesis_model_fills_at_its_rows_and_says_why_it_cannot_extrapolate(log, tmp_path, capsys):
+def test_a_thesis_model_fills_at_its_rows_and_says_why_it_cannot_forecast(log, tmp_path, capsys):
     out = tmp_path / "run"
     options = ["--model.name=gru", "--model.readout=last_row", "--model.hidden_size=3"]
     assert main(["train", str(log), str(out), *READER, *PARTS, *options, *MODEL[2:]]) == 0
     assert main(["impute", str(out), str(log), str(tmp_path / "a.csv")]) == 0
-    error = one_line_error(capsys, "extrapolate", out, log, tmp_path / "b.csv", "--horizons=0.1")
+    error = one_line_error(capsys, "forecast", out, log, tmp_path / "b.csv", "--horizons=0.1")
     assert "can't be asked for times" in error
 
 
@@ -280,7 +280,7 @@ def test_the_lasa_example_runs_from_demonstrations_to_scores(tmp_path, capsys):
 
 def test_the_example_for_one_long_log_runs(log, tmp_path):
     config = Path(__file__).parents[1] / "examples" / "log.yaml"
-    small = ["--training.epochs=1", "--parts.window_s=0.4", "--parts.burst_s=0.05", *MODEL[:2]]
+    small = ["--training.epochs=1", "--split.window_s=0.4", "--split.burst_s=0.05", *MODEL[:2]]
     out = tmp_path / "run"
     assert main(["train", f"--config={config}", *small, *READER, str(log), str(out)]) == 0
     assert ob.load_two_sided(out).forward.names == NAMES

@@ -13,8 +13,7 @@ from model_helpers import dataset, small_model, with_observed
 from scipy.interpolate import PchipInterpolator
 
 import offbeat as ob
-from offbeat.data.thin import hidden_cells
-from offbeat.inference.fill_rule import (
+from offbeat.answers.fill_rule import (
     GROUPS,
     SIDES,
     START,
@@ -23,9 +22,10 @@ from offbeat.inference.fill_rule import (
     _held,
     group_of,
 )
-from offbeat.inference.scoring import ChannelScores, _targets
-from offbeat.inference.trivial import FILLERS, FORECASTERS, fill, forecast
-from offbeat.inference.two_sided import _sides_of, fit_rule, reversed_in_time
+from offbeat.answers.scoring import ChannelScores, _targets
+from offbeat.answers.two_sided import _sides_of, fit_rule, reversed_in_time
+from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
+from offbeat.data.masking import masked_values
 
 NAN = float("nan")
 
@@ -326,9 +326,9 @@ CONFIG = ob.TrainConfig(epochs=2, batch_size=4, optimizer="adam")
 
 
 def trained(out=None) -> tuple[ob.TwoSided, ob.Dataset]:
-    data = ob.thin(dataset(8, rows=15, share=2.0), 0.6, hide="cells", seed=1)
+    data = ob.mask_out(dataset(8, rows=15, share=2.0), 0.6, hide="cells", seed=1)
     train, validation = data[:5], data[5:]
-    model = ob.make("gru_d", train, hidden_size=3, decoder_units=(4,))
+    model = ob.make_model("gru_d", train, hidden_size=3, decoder_units=(4,))
     pair, _, _ = ob.fit_two_sided(model, train, validation, CONFIG, out=out, progress=False)
     return pair, data
 
@@ -336,13 +336,15 @@ def trained(out=None) -> tuple[ob.TwoSided, ob.Dataset]:
 def test_the_backward_model_is_one_trained_on_reversed_trajectories():
     pair, data = trained()
     train, validation = (reversed_in_time(part) for part in (data[:5], data[5:]))
-    alone = ob.make("gru_d", train, hidden_size=3, decoder_units=(4,), scaler=pair.forward.scaler)
+    alone = ob.make_model(
+        "gru_d", train, hidden_size=3, decoder_units=(4,), scaler=pair.forward.scaler
+    )
     ob.fit(alone, train, validation, CONFIG, progress=False)
     for a, b in zip(alone.parameters(), pair.backward.parameters(), strict=True):
         assert a.equal(b)
     again = fit_rule(pair.forward, pair.backward, data[5:])
     assert np.array_equal(again.weights, pair.rule.weights)
-    assert again.cells.sum() == sum(int(hidden_cells(t).sum()) for t in data[5:])
+    assert again.cells.sum() == sum(int(masked_values(t).sum()) for t in data[5:])
 
 
 def test_a_two_sided_run_is_loaded_as_it_was_and_goes_on(tmp_path):
@@ -354,7 +356,7 @@ def test_a_two_sided_run_is_loaded_as_it_was_and_goes_on(tmp_path):
     for other in (loaded, again, ob.load_two_sided(tmp_path / "copy")):
         for a, b in zip(expected, ob.impute(other, data), strict=True):
             assert a.values.tobytes() == b.values.tobytes()
-    forward = ob.load_checkpoint(tmp_path / "run")
+    forward = ob.load_model(tmp_path / "run")
     assert forward.config == pair.forward.config
 
 
@@ -383,7 +385,7 @@ def test_a_rule_can_be_chosen_where_nothing_was_hidden():
 def test_an_extrapolation_is_a_prediction_after_the_last_row():
     data = dataset(3)
     model = small_model("anchored_ode_gru_d", data)
-    ahead = ob.extrapolate(model, data, [0.05, 0.2])
+    ahead = ob.forecast(model, data, [0.05, 0.2])
     asked = [[t.times[-1] + 0.05, t.times[-1] + 0.2] for t in data]
     for a, b in zip(ahead, ob.predict(model, data, times=asked), strict=True):
         assert np.array_equal(a.times, b.times)
@@ -396,7 +398,7 @@ def test_an_extrapolation_is_a_prediction_after_the_last_row():
 def test_horizons_that_are_none_are_refused(horizons):
     data = dataset(2)
     with pytest.raises(ob.InputError, match="horizons must be"):
-        ob.extrapolate(small_model("gru", data), data, horizons)
+        ob.forecast(small_model("gru", data), data, horizons)
 
 
 # --- scores ---------------------------------------------------------------------------------------
@@ -458,7 +460,7 @@ def test_extrapolation_shows_what_was_there_a_horizon_ago_and_nothing_later():
 def test_extrapolation_scores_are_those_of_the_definition():
     data = dataset(3, rows=30)
     model = small_model("anchored_ode_gru_d", data)
-    (scores,) = ob.score_extrapolation(model, data, 0.15, targets=1000)
+    (scores,) = ob.score_forecast(model, data, 0.15, targets=1000)
     errors = {"last_value": [], "anchored_ode_gru_d": []}
     for t in data:
         for row in range(30):
@@ -487,7 +489,7 @@ def test_targets_are_spread_over_the_trajectory_and_no_more_than_asked_for():
     assert len(few) == 5
     assert (few[0], few[-1]) == (every[0], every[-1])
     with pytest.raises(ob.InputError, match="use shorter horizons"):
-        ob.score_extrapolation(small_model("gru", dataset(2)), dataset(2), [1e6])
+        ob.score_forecast(small_model("gru", dataset(2)), dataset(2), [1e6])
 
 
 def test_nothing_hidden_cannot_be_scored():

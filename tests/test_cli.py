@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import offbeat as ob
-from offbeat.cli import COMMANDS, main
+from offbeat.cli.app import COMMANDS, main
 
 SMALL = [
     "--model.name=gru", "--model.hidden_size=4", "--training.epochs=1", "--training.batch_size=8",
@@ -29,7 +29,7 @@ def data(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "first"
-    parts = ["--parts.window=20", "--parts.observed_fraction=0.5"]
+    parts = ["--split.window=20", "--split.observed_fraction=0.5"]
     assert main(["train", str(data), str(out), *SMALL, *parts]) == 0
     return out
 
@@ -84,7 +84,7 @@ def test_simulate_writes_a_data_set_and_says_so_in_json(tmp_path, capsys):
 
 
 def test_train_leaves_everything_that_a_run_needs(run):
-    assert {"config.yaml", "log.csv", "checkpoints", "model", "parts.json", "results.json"} <= {
+    assert {"config.yaml", "log.csv", "checkpoints", "model", "split.json", "results.json"} <= {
         path.name for path in run.iterdir()
     }
     config = yaml.safe_load((run / "config.yaml").read_text())
@@ -171,7 +171,7 @@ def test_predict_answers_at_asked_times_in_original_units(run, data, tmp_path):
         lines = list(csv.DictReader(file))
     assert len(lines) == 24 * 2
     assert [float(line["time"]) for line in lines[:2]] == [0.1, 0.2]
-    expected = ob.predict(ob.load_checkpoint(run), ob.load(data), times=[0.1, 0.2])
+    expected = ob.predict(ob.load_model(run), ob.load(data), times=[0.1, 0.2])
     assert (
         float(lines[1]["waist_qpos"]) == expected[0].values[1, expected.names.index("waist_qpos")]
     )
@@ -262,13 +262,13 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(run, data, tmp_path, capsys
     error = one_line_error(capsys, "train", tmp_path / "none.parquet", out)
     assert "none.parquet" in error
     for fraction in ("0", "1.2"):
-        error = one_line_error(capsys, "train", data, out, f"--parts.observed_fraction={fraction}")
+        error = one_line_error(capsys, "train", data, out, f"--split.observed_fraction={fraction}")
         assert "above 0 and at most 1" in error
     error = one_line_error(capsys, "train", data, out, "--model.name=ode_rn")
     assert "did you mean 'ode_rnn'" in error
     error = one_line_error(capsys, "train", data, out, "--training.epochs=none")
     assert "epochs" in error
-    for option in ("--parts.seed=-1", "--training.seed=-1", "--seed=-1"):
+    for option in ("--split.seed=-1", "--training.seed=-1", "--seed=-1"):
         assert "seed must be" in one_line_error(capsys, "train", data, out, option)
     assert "threads must be" in one_line_error(capsys, "train", data, out, "--threads=0")
     error = one_line_error(capsys, "predict", run, data, out / "a.csv", "--time_unit=ms")
@@ -298,7 +298,7 @@ def test_data_of_other_channels_and_a_damaged_checkpoint_are_refused(run, data, 
     error = one_line_error(capsys, "evaluate", run, walker)
     assert "the model was made for other channels: the data lacks" in error
     copy = tmp_path / "copy"
-    ob.save_checkpoint(ob.load_checkpoint(run), copy)
+    ob.save_model(ob.load_model(run), copy)
     damaged = bytearray((copy / "model.safetensors").read_bytes())
     damaged[-5] ^= 1
     (copy / "model.safetensors").write_bytes(bytes(damaged))
@@ -347,7 +347,7 @@ def test_a_missing_extra_is_named_by_its_extra(tmp_path):
     """A sitecustomize-like block of `mujoco` stands for a machine without it."""
     code = (
         "import sys; sys.modules['mujoco'] = None\n"
-        "from offbeat.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from offbeat.cli.app import main; sys.exit(main(sys.argv[1:]))"
     )
     found = subprocess.run(
         [sys.executable, "-c", code, "simulate", str(tmp_path / "a.parquet")],
@@ -363,7 +363,7 @@ def test_the_example_config_is_the_training_of_the_zoo_and_runs(data, tmp_path):
     path = Path(__file__).parents[1] / "examples" / "anchored.yaml"
     training = yaml.safe_load(path.read_text())["training"]
     assert ob.train_config("anchored_ode_gru_d", epochs=15) == ob.TrainConfig(**training)
-    arguments = ["--parts.window=20", "--training.epochs=1", "--model.hidden_size=4"]
+    arguments = ["--split.window=20", "--training.epochs=1", "--model.hidden_size=4"]
     out = tmp_path / "run"
     assert main(["train", f"--config={path}", *arguments, str(data), str(out)]) == 0
     assert "anchored_ode_gru_d" in (out / "results.json").read_text()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from offbeat.data.clock import (
+from offbeat.data.cleaning.clocks import (
     NANOSECONDS_PER,
     find_time_unit,
     split_unit,

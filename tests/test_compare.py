@@ -12,16 +12,16 @@ import pyarrow.parquet as pq
 import pytest
 
 import offbeat as ob
-from offbeat.cli import main
+from offbeat.cli.app import main
+from offbeat.comparison import Run, compare, read_runs
+from offbeat.comparison.run_files import LAST_VALUE, METRICS
+from offbeat.comparison.runs import parse_only
+from offbeat.comparison.statistics import friedman, holm, paired_comparison, thesis_test
+from offbeat.comparison.text import escape
 from offbeat.errors import FileFormatError, InputError
-from offbeat.report.comparison import Run, compare, read_runs
-from offbeat.report.comparison.run_files import LAST_VALUE, METRICS
-from offbeat.report.comparison.runs import parse_only
-from offbeat.report.comparison.text import escape
-from offbeat.report.figure_ranks import ranks_figure
-from offbeat.report.statistics import friedman, holm, paired_comparison, thesis_test
-from offbeat.report.style import STYLES, style_of
-from offbeat.scores import SCORINGS
+from offbeat.metrics import SCORINGS
+from offbeat.plots.ranks import ranks_figure
+from offbeat.plots.style import STYLES, style_of
 
 LEVELS = {"gru": 0.030, "ode_rnn": 0.0275, "ode_gru_d": 0.027, "anchored_ode_gru_d": 0.019}
 
@@ -41,9 +41,9 @@ def rows(models=LEVELS, repeats=6, fractions=(0.3,), experiment=2, seed=0):
                     "model": model,
                     "observed_fraction": fraction,
                     "repeat": repeat,
-                    "honest_mse": honest,
+                    "after_first_observation_mse": honest,
                     "published_mse": 0.01 + honest,
-                    "last_value_honest_mse": (0.0345 + shared) ** 2,
+                    "last_value_after_first_observation_mse": (0.0345 + shared) ** 2,
                     "last_value_published_mse": 0.011 + shared**2,
                     "commit": "1234567",
                     "cpu": "one",
@@ -67,7 +67,7 @@ def record(tmp_path):
     return write(tmp_path / "record.parquet", rows(fractions=(0.9, 0.3)))
 
 
-def values(table, model, fraction=0.3, metric="honest"):
+def values(table, model, fraction=0.3, metric="after_first_observation"):
     chosen = [r for r in table if (r["model"], r["observed_fraction"]) == (model, fraction)]
     return [r[f"{metric}_mse"] ** 0.5 for r in sorted(chosen, key=lambda r: r["repeat"])]
 
@@ -220,7 +220,7 @@ def test_repeats_that_a_model_lacks_are_refused_or_left_out_when_asked(tmp_path)
 
 def test_runs_that_do_not_share_their_test_part_are_refused(tmp_path):
     table = rows()
-    table[5]["last_value_honest_mse"] *= 1.01
+    table[5]["last_value_after_first_observation_mse"] *= 1.01
     with pytest.raises(InputError, match="repeat 1 do not share their test part: the last-value"):
         compare(write(tmp_path / "a.csv", table))
 
@@ -228,9 +228,11 @@ def test_runs_that_do_not_share_their_test_part_are_refused(tmp_path):
 @pytest.mark.parametrize("value", [math.nan, -1.0])
 def test_a_missing_score_is_refused_and_its_run_named(tmp_path, value):
     table = rows()
-    table[7]["honest_mse"] = value
+    table[7]["after_first_observation_mse"] = value
     path = write(tmp_path / "a.csv", table)
-    with pytest.raises(InputError, match=r"2-anchored_ode_gru_d-0\.3-1 has no honest score"):
+    with pytest.raises(
+        InputError, match=r"2-anchored_ode_gru_d-0\.3-1 has no after_first_observation score"
+    ):
         compare(path)
     assert compare(path, metric="published", resamples=200).family == 6
 
@@ -238,7 +240,7 @@ def test_a_missing_score_is_refused_and_its_run_named(tmp_path, value):
 def test_models_whose_scores_are_equal_are_refused_under_their_condition(tmp_path):
     table = rows({"gru": 0.03, "lstm": 0.03})
     for first, second in zip(table[::2], table[1::2], strict=True):
-        second["honest_mse"] = first["honest_mse"]
+        second["after_first_observation_mse"] = first["after_first_observation_mse"]
     said = "experiment 2, observed_fraction 0.3: 'gru' and 'lstm' differ by the same 0 in all 6"
     with pytest.raises(InputError, match=said):
         compare(write(tmp_path / "a.csv", table))
@@ -247,14 +249,14 @@ def test_models_whose_scores_are_equal_are_refused_under_their_condition(tmp_pat
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"metric": "honset"}, "unknown metric 'honset'.*did you mean 'honest'"),
+        ({"metric": "publised"}, "unknown metric 'publised'.*did you mean .published."),
         ({"error": "mae"}, "unknown error 'mae', expected one of: mse, rmse"),
         ({"baseline": "ode_rn"}, "unknown model 'ode_rn'.*did you mean 'ode_rnn'"),
         ({"models": ["gru"]}, "at least two different models, got: gru"),
         ({"models": ["gru", "gru"]}, "at least two different models"),
         ({"alpha": 5}, "alpha must lie between 0 and 1"),
         ({"confidence": 95}, "confidence must lie between 0 and 1"),
-        ({"metric": "rows_1_99"}, "has no rows_1_99 score"),
+        ({"metric": "after_first_row"}, "has no after_first_row score"),
     ],
 )
 def test_what_is_asked_for_and_not_there_is_refused(record, options, said):
@@ -283,9 +285,12 @@ def test_the_same_run_twice_is_refused(tmp_path, record):
     [
         ("a,b\n1,2\n", "lacks the columns model, repeat; expected a row per run"),
         ("model,repeat\ngru,1\n", "has no column of scores"),
-        ("model,repeat,honest_mse\n", "has no rows"),
-        ("model,repeat,honest_mse\ngru,1,many\n", "row 1 of .*'many' is no number"),
-        ("model,repeat,honest_mse\ngru,1\n", "cannot be read as a table of runs"),
+        ("model,repeat,after_first_observation_mse\n", "has no rows"),
+        (
+            "model,repeat,after_first_observation_mse\ngru,1,many\n",
+            "row 1 of .*'many' is no number",
+        ),
+        ("model,repeat,after_first_observation_mse\ngru,1\n", "cannot be read as a table of runs"),
     ],
 )
 def test_a_table_that_is_none_of_runs_is_refused_in_one_line(tmp_path, text, said):
@@ -449,7 +454,7 @@ def runs(tmp_path_factory):
             arguments = [
                 "train", data, folder / f"{name}-{size}-{repeat}", f"--model.name={name}",
                 f"--model.hidden_size={size}", "--training.epochs=1", "--training.batch_size=8",
-                "--parts.window=20", "--parts.observed_fraction=0.5", f"--parts.seed={repeat}",
+                "--split.window=20", "--split.observed_fraction=0.5", f"--split.seed={repeat}",
                 f"--seed={10 * repeat + size}",
             ]  # fmt: skip
             assert main([str(a) for a in arguments]) == 0
@@ -467,8 +472,10 @@ def test_folders_are_paired_by_the_cut_of_the_data_and_sizes_are_told_apart(runs
     }  # fmt: skip
     scores = json.loads((runs / "rnn-4-1" / "results.json").read_text())["predictors"]
     by_name = {s.model: s.values for s in condition.summaries}
-    assert by_name["rnn"][1] == scores["rnn"]["honest"]["mse"] ** 0.5
-    assert by_name["last_value"][1] == pytest.approx(scores["last_value"]["honest"]["rmse"])
+    assert by_name["rnn"][1] == scores["rnn"]["after_first_observation"]["mse"] ** 0.5
+    assert by_name["last_value"][1] == pytest.approx(
+        scores["last_value"]["after_first_observation"]["rmse"]
+    )
 
 
 def test_runs_on_one_cut_are_paired_by_their_seeds_and_it_is_told(runs, tmp_path):
@@ -479,13 +486,13 @@ def test_runs_on_one_cut_are_paired_by_their_seeds_and_it_is_told(runs, tmp_path
         for seed in range(3):
             folder = tmp_path / f"{name}{seed}"
             folder.mkdir()
-            for file in ("results.json", "parts.json", "config.yaml"):
+            for file in ("results.json", "split.json", "config.yaml"):
                 text = (runs / f"{name}-4-0" / file).read_text()
                 if file == "config.yaml":
                     text = text.replace("seed: 4\nthreads", f"seed: {seed}\nthreads")
                 (folder / file).write_text(text)
             results = json.loads((folder / "results.json").read_text())
-            results["predictors"][name]["honest"]["mse"] *= (
+            results["predictors"][name]["after_first_observation"]["mse"] *= (
                 1 + 0.01 * seed + 0.002 * len(name) * seed
             )
             (folder / "results.json").write_text(json.dumps(results))
@@ -519,7 +526,12 @@ def test_the_command_compares_folders_and_writes_every_form(runs, tmp_path, caps
         "published RMSE on the test part, in scaled units, against gru; alpha 0.05"
     )
     assert "rnn - gru" in text
-    for suffix, first in ((".txt", "honest"), (".md", "honest"), (".tex", "%"), (".json", "{")):
+    for suffix, first in (
+        (".txt", "after_first_observation"),
+        (".md", "after_first_observation"),
+        (".tex", "%"),
+        (".json", "{"),
+    ):
         out = tmp_path / f"a{suffix}"
         assert main(["compare", *folders, f"--out={out}", "--resamples=200"]) == 0
         assert out.read_text().startswith(first)
@@ -569,7 +581,13 @@ def test_the_metrics_are_the_scorings_of_the_package():
 
 def test_runs_may_be_made_by_hand():
     made = [
-        Run(f"{m}{i}", m, "mine", str(i), {"honest": (level + 0.001 * i + 0.0001 * i * j) ** 2})
+        Run(
+            f"{m}{i}",
+            m,
+            "mine",
+            str(i),
+            {"after_first_observation": (level + 0.001 * i + 0.0001 * i * j) ** 2},
+        )
         for j, (m, level) in enumerate((("a", 0.1), ("b", 0.2)))
         for i in range(5)
     ]
@@ -582,7 +600,7 @@ def test_a_comparison_imports_no_torch(record):
     code = (
         f"import sys, offbeat\n"
         f"offbeat.compare({str(record)!r}, resamples=200).text()\n"
-        "import offbeat.report.figure_ranks\n"
+        "import offbeat.plots.ranks\n"
         "assert 'torch' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

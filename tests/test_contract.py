@@ -31,14 +31,14 @@ from offbeat import (
     Batch,
     Dataset,
     InputError,
+    Model,
     ModelConfig,
-    RecurrentModel,
     Trajectory,
     kernels,
-    load_checkpoint,
-    make,
+    load_model,
+    make_model,
     predict,
-    save_checkpoint,
+    save_model,
     thesis_config,
 )
 from offbeat.models.zoo import THESIS_MODELS, ZOO, resolve
@@ -52,7 +52,11 @@ def option_sets(name: str) -> dict[str, dict[str, Any]]:
     entry = resolve(ModelConfig(name=name))
     sets: dict[str, dict[str, Any]] = {"": {}, "first_row": {"clock": "first_row"}}
     if entry.cell != "none":
-        sets["every"] = {"update_rows": "every", "age_input": "delta", "age_unit": "longest"}
+        sets["every"] = {
+            "update_rows": "every",
+            "time_input": "delta",
+            "time_input_unit": "longest",
+        }
         if not entry.anchored:
             sets["self_feeding"] = {"self_feeding": 0.5}
     if entry.cell == "gru":
@@ -87,7 +91,7 @@ variants = pytest.mark.parametrize("variant", list(VARIANTS))
 dtypes = pytest.mark.parametrize("dtype", [FLOAT32, FLOAT64], ids=["float32", "float64"])
 
 
-def build(variant: str, dtype: torch.dtype = FLOAT64, **options: Any) -> RecurrentModel:
+def build(variant: str, dtype: torch.dtype = FLOAT64, **options: Any) -> Model:
     return small_model(replace(VARIANTS[variant], **options), dtype=dtype)
 
 
@@ -120,8 +124,8 @@ def test_a_saved_model_predicts_the_same_bit_for_bit(
     variant: str, dtype: torch.dtype, tmp_path: Path
 ) -> None:
     model, data = build(variant, dtype), dataset(3)
-    save_checkpoint(model, tmp_path / "model")
-    again = load_checkpoint(tmp_path / "model")
+    save_model(model, tmp_path / "model")
+    again = load_model(tmp_path / "model")
     assert again.config == model.config
     assert again.statistics == model.statistics
     assert (again.names, again.units) == (model.names, model.units)
@@ -251,8 +255,8 @@ def test_hidden_values_leave_no_trace_in_gradients(variant: str) -> None:
 # --- a stream is the same loop --------------------------------------------------------------------
 
 
-def in_parts(model: RecurrentModel, batch: Batch, edges: list[int]) -> Tensor:
-    carry = model.empty_carry(len(batch))
+def in_parts(model: Model, batch: Batch, edges: list[int]) -> Tensor:
+    carry = model.empty_state(len(batch))
     parts = []
     with torch.no_grad():
         for start, stop in pairwise(edges):
@@ -292,7 +296,7 @@ def with_empty_rows(data: Dataset, *, seed: int = 0) -> tuple[Dataset, list[Any]
     return Dataset(tuple(made)), own
 
 
-def effect_of_empty_rows(model: RecurrentModel, data: Dataset) -> float:
+def effect_of_empty_rows(model: Model, data: Dataset) -> float:
     """Largest change of a prediction at the rows that were there before."""
     more, own = with_empty_rows(data)
     expected, got = (predictions(model, model.batch(d)) for d in (data, more))
@@ -363,8 +367,8 @@ ASKED = {
     "every": {"update_rows": "every"},
     "every_row": {"decay": "trainable", "decay_rows": "every_row"},
     "observed_rows": {"decay": "trainable", "decay_rows": "observed_rows"},
-    "gap": {"age_input": "gap"},
-    "first_row": {"clock": "first_row", "age_input": "elapsed"},
+    "gap": {"time_input": "gap"},
+    "first_row": {"clock": "first_row", "time_input": "elapsed"},
     "last_row": {"readout": "last_row"},
     "self_feeding": {"self_feeding": 0.5},
     "zoo": {},
@@ -393,7 +397,7 @@ def test_asked_times_change_no_other_prediction_or_are_refused(name: str, choice
 # --- gradients ------------------------------------------------------------------------------------
 
 
-def gradients(model: RecurrentModel, batch: Batch) -> dict[str, Tensor | None]:
+def gradients(model: Model, batch: Batch) -> dict[str, Tensor | None]:
     model.zero_grad()
     target = torch.cos(torch.arange(batch.values.numel()).to(model.dtype)).view_as(batch.values)
     loss = ((model(batch).predictions - target) * batch.valid[..., None]).square().sum()
@@ -405,7 +409,7 @@ def gradients(model: RecurrentModel, batch: Batch) -> dict[str, Tensor | None]:
 def test_a_gradient_reaches_every_parameter_under_masks_per_channel(variant: str) -> None:
     """At the initial weights, from which training starts, and at others."""
     data = dataset(4)
-    initial = make(VARIANTS[variant], dataset(6, seed=9)).double()
+    initial = make_model(VARIANTS[variant], dataset(6, seed=9)).double()
     for model in (initial, with_growing_decays(build(variant))):
         for name, gradient in gradients(model, model.batch(data)).items():
             assert gradient is not None, name

@@ -11,9 +11,9 @@ from PIL import Image
 from offbeat import demo
 from offbeat.demo import ANCHORED, run_demo
 from offbeat.errors import InputError, MissingExtraError, OffbeatError
-from offbeat.experiment import side_by_side
 from offbeat.models.zoo import THESIS_MODELS
-from offbeat.report import animation
+from offbeat.plots import animation
+from offbeat.sweeps import side_by_side
 
 TINY = {"n_trajectories": 40, "epochs": 1, "anchored_epochs": 2, "progress": False}
 PREDICTORS = {*THESIS_MODELS, ANCHORED, "last_value"}
@@ -69,14 +69,17 @@ def test_every_predictor_has_a_line_of_results(made):
         "steps",
         "epochs",
         "training_seconds",
-        "honest_rmse",
-        "honest_hidden_rmse",
-        "rows_1_99_rmse",
+        "after_first_observation_rmse",
+        "masked_rmse",
+        "after_first_row_rmse",
         "published_rmse",
         "under_trained",
     ]
     for name, line in lines.items():
-        assert float(line["honest_rmse"]) == made.evaluation.scores[name].honest.rmse
+        assert (
+            float(line["after_first_observation_rmse"])
+            == made.evaluation.scores[name].after_first_observation.rmse
+        )
         assert float(line["published_rmse"]) == made.evaluation.scores[name].published.rmse
         assert line["under_trained"] == ("false" if name == "last_value" else "true")
     # 28 trajectories are one batch, so an epoch is a step.

@@ -11,14 +11,16 @@ from test_contract import VARIANTS, build, dataset
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.inference.fused_engine import FusedEngine
-from offbeat.inference.torch_engine import TorchEngine
-from offbeat.kernels import fused
+from offbeat.kernels import cpu
+from offbeat.stream.cpu_engine import CpuEngine
+from offbeat.stream.torch_engine import TorchEngine
 
-pytestmark = pytest.mark.skipif(not fused.bodies(), reason="the fused body was not built")
+pytestmark = pytest.mark.skipif(
+    not cpu.instruction_sets(), reason="the compiled backend was not built"
+)
 
 
-@pytest.mark.parametrize("body", fused.bodies() or ["none"])
+@pytest.mark.parametrize("body", cpu.instruction_sets() or ["none"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_every_row_of_a_stream_has_the_bits_of_the_batch(
@@ -27,13 +29,13 @@ def test_every_row_of_a_stream_has_the_bits_of_the_batch(
     """Of a batch with mates and padding; the state is exported, lost and restored on the way."""
     with kernels.use(body):
         model = build(variant, dtype)
-        if not model.runs_fused():
-            pytest.skip("its solver or gradient has no fused body")
+        if not model.runs_compiled():
+            pytest.skip("its solver or gradient has no compiled backend")
         batch = model.batch(dataset(4))
         with torch.no_grad():
             expected = model(batch).predictions.double().numpy()
         for i, length in enumerate(batch.valid.sum(dim=1).tolist()):
-            engine = FusedEngine(model)
+            engine = CpuEngine(model)
             engine.reserve(1)
             previous: tuple[Any, ...] = ()
             for row in range(length):
@@ -71,7 +73,7 @@ def test_the_public_stream_has_the_bits_of_predict(name: str) -> None:
 
 def test_a_state_moves_between_the_engines() -> None:
     model = build("ode_gru_d", torch.float64)
-    mine, other = FusedEngine(model), TorchEngine(model)
+    mine, other = CpuEngine(model), TorchEngine(model)
     mask = np.ones(model.channels, dtype=bool)
     for time in (0.0, 0.4, 1.0):
         mine.observe(time, np.full(model.channels, time), mask)
@@ -89,14 +91,14 @@ def test_a_state_moves_between_the_engines() -> None:
 
 def test_a_stream_of_a_model_without_fused_body_runs_in_torch() -> None:
     model = build("ode_rnn-dopri5", torch.float64)
-    assert not model.runs_fused()
+    assert not model.runs_compiled()
     stream = ob.Stream(model)
     stream.observe(0.0, np.zeros(model.channels))
     assert np.isfinite(stream.predict(0.5)).all()
 
 
 def test_arrays_of_another_type_are_refused() -> None:
-    engine = FusedEngine(build("gru", torch.float32))
+    engine = CpuEngine(build("gru", torch.float32))
     mask = np.ones(engine._model.channels, dtype=bool)
     with pytest.raises(TypeError):
         engine.observe(0.0, np.zeros(len(mask)), mask)  # float64 for a float32 model

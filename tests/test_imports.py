@@ -18,19 +18,23 @@ STAGES = (
     "files",
     "config",
     "data",
-    "solvers",
+    "ode",
     "kernels",
+    "parts",
     "models",
-    "scores",
-    "run_state",
+    "metrics",
+    "baselines",
+    "run",
     "training",
-    "inference",
+    "answers",
     "evaluation",
-    "experiment",
-    "report",
+    "stream",
+    "export",
+    "comparison",
+    "plots",
+    "sweeps",
     "demo",
     "doctor",
-    "commands",
     "cli",
     "__main__",
     "__init__",
@@ -50,8 +54,8 @@ def faults(source: Path) -> list[str]:
             found.append(f"{where}: {name!r} belongs to no stage; add it to STAGES")
             continue
         for line, target in imports(path, source):
-            if name == "report" and target.split(".")[0] == "torch":
-                found.append(f"{where}:{line}: report imports torch; it reads records only")
+            if name == "plots" and target.split(".")[0] == "torch":
+                found.append(f"{where}:{line}: plots imports torch; figures draw arrays")
             if target.split(".")[0] != source.name:
                 continue
             stage = stage_of(target, source)
@@ -98,29 +102,33 @@ def test_no_module_imports_from_a_later_stage():
     ("file", "code", "fault"),
     [
         ("errors.py", "from offbeat.files import f", "errors.py:1: errors imports offbeat.files.f"),
-        ("data/thin.py", "import offbeat.models.zoo", "data imports offbeat.models.zoo of the"),
-        ("data/thin.py", "def f():\n    from offbeat.training import fit", "data/thin.py:2: data"),
+        ("data/masking.py", "import offbeat.models.zoo", "data imports offbeat.models.zoo of the"),
         (
-            "solvers/fixed.py",
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ..models import zoo",
-            "solvers/fixed.py:3: solvers imports offbeat.models.zoo of the later stage models",
+            "data/masking.py",
+            "def f():\n    from offbeat.training import fit",
+            "data/masking.py:2: data",
         ),
-        ("data/__init__.py", "from ..report import page", "of the later stage report"),
+        (
+            "ode/fixed.py",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ..models import zoo",
+            "ode/fixed.py:3: ode imports offbeat.models.zoo of the later stage models",
+        ),
+        ("data/__init__.py", "from ..plots import style", "of the later stage plots"),
         ("models/zoo.py", "import offbeat", "models imports offbeat of the later stage __init__"),
         ("models/zoo.py", "from offbeat import fit", "models imports offbeat.fit of the later"),
         ("models/zoo.py", "from offbeat import cli", "models imports offbeat.cli of the later"),
         (
             "models/zoo.py",
-            "import importlib\nimportlib.import_module('offbeat.cli')",
-            "zoo.py:2: models imports offbeat.cli",
+            "import importlib\nimportlib.import_module('offbeat.cli.app')",
+            "zoo.py:2: models imports offbeat.cli.app",
         ),
         ("stray.py", "", "stray.py: 'stray' belongs to no stage"),
         ("stray/part.py", "", "stray/part.py: 'stray' belongs to no stage"),
-        ("report/page.py", "import torch.nn", "report/page.py:1: report imports torch"),
+        ("plots/page.py", "import torch.nn", "plots/page.py:1: plots imports torch"),
         (
-            "report/page.py",
+            "plots/page.py",
             "def f():\n    from torch import nn",
-            "report/page.py:2: report imports",
+            "plots/page.py:2: plots imports",
         ),
     ],
 )
@@ -140,7 +148,7 @@ def test_the_check_accepts_imports_along_the_arrow(tmp_path):
         "import torch\n"
         "from offbeat import __version__, errors\n"
         "from offbeat.data.batch import Batch\n"
-        "from ..solvers import fixed\n"
+        "from ..ode import fixed\n"
         "from .cell import GRUCell\n",
         encoding="utf-8",
     )

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from real_logs import shared
 
-from offbeat.cli import main
+from offbeat.cli.app import main
 from offbeat.data.advice import advise
 from offbeat.data.inspection import inspect
 from offbeat.data.readers import read

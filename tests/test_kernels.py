@@ -19,26 +19,28 @@ from scan_problems import CELLS, FLOWS, Problem, largest_error, problem, run
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.kernels import RowTable, ScanRows, TableRows, fused, reference
+from offbeat.kernels import StepInputs, StepTable, TableSteps, cpu, reference
 from offbeat.models.zoo import ZOO
 
-needs_fused = pytest.mark.skipif(not fused.bodies(), reason="the fused body was not built")
-bodies = pytest.mark.parametrize("body", fused.bodies() or ["none"])
+needs_fused = pytest.mark.skipif(
+    not cpu.instruction_sets(), reason="the compiled backend was not built"
+)
+bodies = pytest.mark.parametrize("body", cpu.instruction_sets() or ["none"])
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
 def agree(case: Problem, body: str, *, keep: bool = True, strict: bool = True) -> None:
-    """The fused body runs this very call, or raises; its results equal the reference body's.
+    """The compiled backend runs this very call, or raises; its results equal the reference backend's.
 
     Where it is not `strict`, shapes are random, and a tensor may be all cancellation: its largest
     entry counts as at least a thousandth of all tensors' largest, and in single precision it is
-    enough to be as near to double precision as the reference body is, times three.
+    enough to be as near to double precision as the reference backend is, times three.
     """
     expected = run(reference.scan, case)
     with pytest.MonkeyPatch.context() as patch:
         if not keep:
-            patch.setattr(fused, "TAPE_LIMIT", 0)
-        got = run(lambda *a: fused.scan(*a, body), case)
+            patch.setattr(cpu, "TAPE_LIMIT", 0)
+        got = run(lambda *a: cpu.scan(*a, body), case)
     exact = expected
     if not strict and case.state.dtype == torch.float32:
         exact = run(reference.scan, case.double())
@@ -56,8 +58,8 @@ def test_the_fused_body_is_there_wherever_it_could_be_built() -> None:
     compilers = filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++"))
     if not any(shutil.which(compiler) for compiler in compilers):
         pytest.skip("no C++ compiler is here")
-    assert fused.bodies(), fused.why_not
-    assert kernels.body()[0] == fused.bodies()[0]
+    assert cpu.instruction_sets(), cpu.why_not
+    assert kernels.backend()[0] == cpu.instruction_sets()[0]
 
 
 # --- equal to the reference -----------------------------------------------------------------------
@@ -148,7 +150,7 @@ def test_gradients_equal_finite_differences(cell: str) -> None:
     inputs = (*weights.tensors(), state)
 
     def function(*tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return fused.scan(spec, case.with_weights(tensors[:-1]), rows, tensors[-1])
+        return cpu.scan(spec, case.with_weights(tensors[:-1]), rows, tensors[-1])
 
     assert torch.autograd.gradcheck(function, inputs, atol=1e-7, rtol=1e-5)
 
@@ -173,7 +175,7 @@ def test_a_fused_perceptron_equals_the_reference(
     x, weight = drawn(rows, sizes[0]).requires_grad_(), drawn(rows, sizes[-1])
     found = []
     for y in (
-        fused.perceptron(layers, x, activation, body),
+        cpu.perceptron(layers, x, activation, body),
         reference.perceptron(layers, x, activation),
     ):
         leaves = [x, *(t for layer in layers for t in layer)]
@@ -202,7 +204,7 @@ def test_the_number_of_threads_changes_no_bit(name: str, body: str) -> None:
     try:
         for n in (1, 2, 3, 7):
             torch.set_num_threads(n)
-            found.append(run(lambda *a: fused.scan(*a, body), case))
+            found.append(run(lambda *a: cpu.scan(*a, body), case))
     finally:
         torch.set_num_threads(threads)
     for other in found[1:]:
@@ -218,10 +220,10 @@ def test_batch_mates_padding_and_place_change_no_bit_of_a_trajectory(name: str, 
     spec, weights, rows, state, _ = case
     assert rows.length is not None
     with torch.no_grad():
-        whole = fused.scan(spec, weights, rows, state, body)
+        whole = cpu.scan(spec, weights, rows, state, body)
         for i in (0, 5, 36):
             n = int(rows.length[i])
-            alone = fused.scan(
+            alone = cpu.scan(
                 spec, weights, cut(rows, slice(i, i + 1), slice(0, n)), state[i : i + 1], body
             )
             for got, expected in zip(alone, whole, strict=True):
@@ -234,10 +236,10 @@ def test_batch_mates_padding_and_place_change_no_bit_of_a_trajectory(name: str, 
 def test_batches_of_any_width_have_the_same_bits(name: str, body: str) -> None:
     case = problem(seed=7, batch=21, rows=5, channels=4, hidden=7, **BITS[name])
     with torch.no_grad():
-        whole = fused.scan(*case[:4], body)
+        whole = cpu.scan(*case[:4], body)
         for n in range(1, 21):
             rows = cut(case.rows, slice(n), slice(None))
-            part = fused.scan(case.spec, case.weights, rows, case.state[:n], body)
+            part = cpu.scan(case.spec, case.weights, rows, case.state[:n], body)
             for got, expected in zip(part, whole, strict=True):
                 assert torch.equal(got, expected[:n]), n
 
@@ -257,10 +259,10 @@ def test_when_gradients_of_weights_are_added_changes_no_bit(
     body: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case = problem(seed=5, batch=21, rows=40, channels=4, hidden=7, **BITS["bounded steps"])
-    expected = run(lambda *a: fused.scan(*a, body), case)
+    expected = run(lambda *a: cpu.scan(*a, body), case)
     for rows in (1, 3, 40):
-        monkeypatch.setattr(fused, "ROWS_AT_ONCE", rows)
-        for key, value in run(lambda *a: fused.scan(*a, body), case).items():
+        monkeypatch.setattr(cpu, "ROWS_AT_ONCE", rows)
+        for key, value in run(lambda *a: cpu.scan(*a, body), case).items():
             assert torch.equal(value, expected[key]), (rows, key)
 
 
@@ -269,7 +271,7 @@ def test_when_gradients_of_weights_are_added_changes_no_bit(
 @pytest.mark.parametrize("name", list(BITS))
 def test_rows_of_a_table_have_the_bits_of_rows_that_are_gathered(name: str, body: str) -> None:
     case = problem(seed=4, batch=30, rows=12, channels=4, hidden=7, padded=True, **BITS[name])
-    picked = RowTable.of(case.rows).take(torch.tensor([29, 3, 3, 17, 0]))
+    picked = StepTable.of(case.rows).take(torch.tensor([29, 3, 3, 17, 0]))
     at, rows = picked.index, picked.rows
     in_place = case._replace(
         rows=picked,
@@ -277,8 +279,8 @@ def test_rows_of_a_table_have_the_bits_of_rows_that_are_gathered(name: str, body
         factors=tuple(factor[at, :rows] for factor in case.factors),
     )
     gathered = in_place._replace(rows=picked.gathered())
-    expected = run(lambda *a: fused.scan(*a, body), gathered)
-    for key, value in run(lambda *a: fused.scan(*a, body), in_place).items():
+    expected = run(lambda *a: cpu.scan(*a, body), gathered)
+    for key, value in run(lambda *a: cpu.scan(*a, body), in_place).items():
         assert torch.equal(value, expected[key]), key
 
 
@@ -286,9 +288,9 @@ def test_rows_of_a_table_have_the_bits_of_rows_that_are_gathered(name: str, body
 @pytest.mark.parametrize("index", [[0, 30], [-1, 0]])
 def test_an_index_that_is_not_in_the_table_is_refused(index: list[int]) -> None:
     case = problem(seed=4, batch=30, rows=12, channels=4, hidden=7, **BITS["lstm"])
-    rows = TableRows(RowTable.of(case.rows), torch.tensor(index), 12, None)
+    rows = TableSteps(StepTable.of(case.rows), torch.tensor(index), 12, None)
     with pytest.raises(ValueError, match="is not in the table of 30 trajectories"):
-        fused.scan(case.spec, case.weights, rows, case.state[:2])
+        cpu.scan(case.spec, case.weights, rows, case.state[:2])
 
 
 @needs_fused
@@ -298,16 +300,16 @@ def test_row_by_row_gives_the_bits_of_the_whole_sequence(name: str, body: str) -
     case = problem(seed=8, batch=19, rows=11, channels=4, hidden=7, **BITS[name])
     spec, weights, rows, state, _ = case
     with torch.no_grad():
-        before, after = fused.scan(spec, weights, rows, state, body)
+        before, after = cpu.scan(spec, weights, rows, state, body)
         for i in range(rows.rows):
             part = cut(rows, slice(None), slice(i, i + 1))
-            one_before, one_after = fused.scan(spec, weights, part, state, body)
+            one_before, one_after = cpu.scan(spec, weights, part, state, body)
             assert torch.equal(one_before[:, 0], before[:, i])
             assert torch.equal(one_after[:, 0], after[:, i])
             state = one_after[:, 0]
 
 
-def cut(rows: ScanRows, lanes: slice, at: slice) -> ScanRows:
+def cut(rows: StepInputs, lanes: slice, at: slice) -> StepInputs:
     """Some rows of some trajectories; none of them is padding."""
     changed: dict[str, Any] = {"length": None}
     for name in ("gap", "update", "values", "mask", "age", "updated", "decay_start", "decay_end",
@@ -330,8 +332,8 @@ def test_padding_receives_no_gradient_and_gives_none() -> None:
         values=torch.where(padding[..., None], float("nan"), case.rows.values),
         gap=torch.where(padding, 1e30, case.rows.gap),
     )
-    expected = run(fused.scan, case)
-    got = run(fused.scan, case._replace(rows=wild))
+    expected = run(cpu.scan, case)
+    got = run(cpu.scan, case._replace(rows=wild))
     for key, value in expected.items():
         assert torch.equal(got[key], value), key
 
@@ -349,7 +351,7 @@ def test_arrays_are_taken_as_they_are_or_refused() -> None:
         "decay_start": None, "decay_end": None, "delta": None, "last": None, "mean": None,
         "fed": None, "length": None,
     }  # fmt: skip
-    make = fused.compiled.Facts_f32
+    make = cpu.compiled.Facts_f32
     make(**good)
     with pytest.raises(TypeError):
         make(**{**good, "values": good["values"].astype("float64")})
@@ -372,7 +374,7 @@ def test_arrays_are_taken_as_they_are_or_refused() -> None:
 def test_shapes_that_disagree_are_refused_by_name(change: dict[str, Any], message: str) -> None:
     case = problem(seed=1, batch=2, rows=3, channels=2, hidden=3, cell="gru", flow="euler")
     with pytest.raises(ValueError, match=message):
-        fused.scan(case.spec, case.weights, replace(case.rows, **change), case.state)
+        cpu.scan(case.spec, case.weights, replace(case.rows, **change), case.state)
 
 
 @needs_fused
@@ -388,12 +390,12 @@ def test_what_the_fused_body_cannot_run_goes_to_the_reference(
     options: dict[str, Any], why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, batch = made("ode_rnn", options)
-    rows, _ = model.facts(batch)
-    state = model.empty_carry(len(batch)).state
-    assert why in fused.unsupported(model.spec, model.scan_weights(), rows, state)
+    rows, _ = model.step_inputs(batch)
+    state = model.empty_state(len(batch)).state
+    assert why in cpu.unsupported(model.spec, model.scan_weights(), rows, state)
     with pytest.raises(RuntimeError, match=why):
-        fused.scan(model.spec, model.scan_weights(), rows, state)
-    monkeypatch.setattr(fused, "scan", lambda *_: pytest.fail("the wrong body ran"))
+        cpu.scan(model.spec, model.scan_weights(), rows, state)
+    monkeypatch.setattr(cpu, "scan", lambda *_: pytest.fail("the wrong body ran"))
     model(batch)
 
 
@@ -407,7 +409,7 @@ def test_every_model_of_the_zoo_runs_in_the_fused_body(
     model(batch).predictions.sum().backward()
     monkeypatch.undo()
     with kernels.use("reference"):
-        monkeypatch.setattr(fused, "scan", lambda *_: pytest.fail("the wrong body ran"))
+        monkeypatch.setattr(cpu, "scan", lambda *_: pytest.fail("the wrong body ran"))
         model(batch)
 
 
@@ -422,22 +424,22 @@ def test_observed_values_that_need_a_gradient_go_to_the_reference_and_get_one() 
 
 
 def test_a_body_that_cannot_run_here_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ob.InputError, match="scan body 'cuda'"), kernels.use("cuda"):
+    with pytest.raises(ob.InputError, match="scan backend 'cuda'"), kernels.use("cuda"):
         pass
     monkeypatch.setenv("OFFBEAT_SCAN", "reference")
-    assert kernels.body() == ("reference", "asked for by OFFBEAT_SCAN")
-    monkeypatch.setenv("OFFBEAT_SCAN", "fused")
-    monkeypatch.setattr(fused, "bodies", list)
+    assert kernels.backend() == ("reference", "asked for by OFFBEAT_SCAN")
+    monkeypatch.setenv("OFFBEAT_SCAN", "cpu")
+    monkeypatch.setattr(cpu, "instruction_sets", list)
     with pytest.raises(ob.InputError, match="was not built"):
-        kernels.body()
+        kernels.backend()
 
 
 def test_without_the_compiled_module_everything_runs_in_the_reference_body(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(fused, "compiled", None)
-    monkeypatch.setattr(fused, "why_not", "no module")
-    assert kernels.body() == ("reference", "the fused body was not built: no module")
+    monkeypatch.setattr(cpu, "compiled", None)
+    monkeypatch.setattr(cpu, "why_not", "no module")
+    assert kernels.backend() == ("reference", "the compiled backend was not built: no module")
     model, batch = made("ode_gru_d", {})
     assert bool(model(batch).predictions.isfinite().all())
 
@@ -449,7 +451,7 @@ def test_without_the_compiled_module_everything_runs_in_the_reference_body(
 def test_what_a_step_records_is_freed_with_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A record that its own outputs kept alive would take the memory of every step in turn."""
     model, batch = made(name, {})
-    rows, _ = model.facts(batch)
+    rows, _ = model.step_inputs(batch)
     kept = weakref.ref(rows.gap)
     predictions, *_ = model.run(rows)
     predictions.sum().backward()
@@ -460,7 +462,7 @@ def test_what_a_step_records_is_freed_with_it(name: str, monkeypatch: pytest.Mon
     assert kept() is None
 
 
-def made(name: str, options: dict[str, Any]) -> tuple[ob.RecurrentModel, ob.Batch]:
+def made(name: str, options: dict[str, Any]) -> tuple[ob.Model, ob.Batch]:
     data = dataset(5, seed=3)
-    model = draw_weights(ob.make(name, data, **{**SMALL, **options}))
+    model = draw_weights(ob.make_model(name, data, **{**SMALL, **options}))
     return model, model.batch(data)

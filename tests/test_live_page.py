@@ -11,10 +11,10 @@ from typing import get_args
 
 import pytest
 
-from offbeat import StreamPolicies
-from offbeat.inference.lines import LineSession
-from offbeat.inference.onnx_runner import STATE
-from offbeat.inference.policies import Outcome, StreamCounters
+from offbeat import StreamOptions
+from offbeat.export.runner import STATE
+from offbeat.stream.lines import LineSession
+from offbeat.stream.options import Outcome, StreamCounters
 
 PAGE = (Path(__file__).parents[1] / "docs" / "live.md").read_text(encoding="utf-8")
 
@@ -47,7 +47,7 @@ def test_the_blocks_run_one_after_the_other(tmp_path, monkeypatch, capsys):
 
 
 def test_the_page_names_every_policy_counter_outcome_and_input():
-    for record in (StreamPolicies, StreamCounters):
+    for record in (StreamOptions, StreamCounters):
         assert [f.name for f in fields(record) if f.name not in PAGE] == []
     assert [outcome for outcome in get_args(Outcome) if f"`{outcome}`" not in PAGE] == []
     assert [name for name in STATE if f"| `{name}` |" not in PAGE] == []

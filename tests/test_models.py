@@ -28,10 +28,10 @@ from offbeat import (
     Batch,
     Dataset,
     InputError,
-    RecurrentModel,
+    Model,
     Trajectory,
     kernels,
-    make,
+    make_model,
     thesis_config,
 )
 from offbeat.models.zoo import THESIS_MODELS, ZOO
@@ -60,7 +60,7 @@ def late_sample(*, whole_rows: bool = False) -> Dataset:
     return Dataset((with_observed(one, observed),))
 
 
-def rows_of(model: RecurrentModel, data: Dataset) -> list[tuple[float, Tensor, Tensor]]:
+def rows_of(model: Model, data: Dataset) -> list[tuple[float, Tensor, Tensor]]:
     """Of the first trajectory: model time, scaled values with 0 where hidden, and mask."""
     one = data[0]
     values = torch.from_numpy(model.scaler.scaled(one.values))
@@ -70,17 +70,17 @@ def rows_of(model: RecurrentModel, data: Dataset) -> list[tuple[float, Tensor, T
     return [(float(t), v, m) for t, v, m in zip(times, hidden, mask, strict=True)]
 
 
-def median_gap(model: RecurrentModel) -> float:
+def median_gap(model: Model) -> float:
     """In model time."""
     return float(model.config.typical_gap or 0)
 
 
-def decoded(model: RecurrentModel, h: Tensor) -> Tensor:
+def decoded(model: Model, h: Tensor) -> Tensor:
     weights, biases = model.decoder.weights, model.decoder.biases  # type: ignore[union-attr]
     return weights[1] @ torch.tanh(weights[0] @ h + biases[0]) + biases[1]
 
 
-def field_of(model: RecurrentModel) -> nn.Module:
+def field_of(model: Model) -> nn.Module:
     """The vector field as a module of torch's own, as torchdiffeq takes it."""
     nonlinearity = {"tanh": nn.Tanh, "silu": nn.SiLU}[model.config.activation or ""]
     layers: list[nn.Module] = []
@@ -97,7 +97,7 @@ def field_of(model: RecurrentModel) -> nn.Module:
     return Autonomous()
 
 
-def integrated(model: RecurrentModel, y: Tensor, gap: float, method: str, **options: Any) -> Tensor:
+def integrated(model: Model, y: Tensor, gap: float, method: str, **options: Any) -> Tensor:
     if gap == 0:
         return y
     steps = options.pop("steps", 1)
@@ -107,7 +107,7 @@ def integrated(model: RecurrentModel, y: Tensor, gap: float, method: str, **opti
     return torchdiffeq.odeint(field_of(model), y, grid, method=method, **options)[-1]
 
 
-def gru_by_matrices(model: RecurrentModel, h: Tensor, x: Tensor) -> Tensor:
+def gru_by_matrices(model: Model, h: Tensor, x: Tensor) -> Tensor:
     """Equations 20 to 23, gates in the order update, reset, candidate."""
     cell = model.cell
     w_z, w_r, w_h = cell.inputs.chunk(3)
@@ -119,7 +119,7 @@ def gru_by_matrices(model: RecurrentModel, h: Tensor, x: Tensor) -> Tensor:
     return (1 - z) * h + z * candidate
 
 
-def states_of(model: RecurrentModel, data: Dataset) -> tuple[Tensor, Tensor, Tensor]:
+def states_of(model: Model, data: Dataset) -> tuple[Tensor, Tensor, Tensor]:
     """Predictions, states before and after each row, of the first trajectory; of both bodies."""
     batch = model.batch(data)
     with torch.no_grad():
@@ -134,7 +134,7 @@ def states_of(model: RecurrentModel, data: Dataset) -> tuple[Tensor, Tensor, Ten
 # --- cells against torch.nn -----------------------------------------------------------------------
 
 
-def plain_inputs(model: RecurrentModel, data: Dataset) -> list[tuple[bool, Tensor]]:
+def plain_inputs(model: Model, data: Dataset) -> list[tuple[bool, Tensor]]:
     """Of each row: whether it is observed, and [values, mask, time since the last observed row]."""
     found, latest = [], None
     for time, values, mask in rows_of(model, data):
@@ -217,7 +217,7 @@ def sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-x))
 
 
-def gru_in_floats(model: RecurrentModel, h: list[float], x: list[float]) -> list[float]:
+def gru_in_floats(model: Model, h: list[float], x: list[float]) -> list[float]:
     """Equations 20 to 23, or 29 to 32 where x is x-hat and mask."""
     n = len(h)
     inputs, bias = model.cell.inputs.tolist(), model.cell.bias.tolist()
@@ -238,16 +238,18 @@ def gru_in_floats(model: RecurrentModel, h: list[float], x: list[float]) -> list
     return [(1 - z[j]) * h[j] + z[j] * candidate[j] for j in range(n)]
 
 
-@pytest.mark.parametrize("age_input", ["none", "elapsed", "gap", "delta"])
-@pytest.mark.parametrize("age_unit", ["gap", "longest"])
+@pytest.mark.parametrize("time_input", ["none", "elapsed", "gap", "delta"])
+@pytest.mark.parametrize("time_input_unit", ["gap", "longest"])
 @pytest.mark.parametrize("update_rows", ["observed", "every"])
 def test_gru_is_equations_20_to_23_in_plain_floats(
-    age_input: str, age_unit: str, update_rows: str
+    time_input: str, time_input_unit: str, update_rows: str
 ) -> None:
     data = sample()
-    model = small_model("gru", age_input=age_input, age_unit=age_unit, update_rows=update_rows)
+    model = small_model(
+        "gru", time_input=time_input, time_input_unit=time_input_unit, update_rows=update_rows
+    )
     longest = model.statistics.longest_delta / model.time_unit
-    unit = median_gap(model) if age_unit == "gap" else longest
+    unit = median_gap(model) if time_input_unit == "gap" else longest
     assert longest > 2 * median_gap(model)
     h, after = [0.0] * model.hidden_size, []
     before = latest = 0.0
@@ -260,7 +262,7 @@ def test_gru_is_equations_20_to_23_in_plain_floats(
             "elapsed": [(time - latest) / unit],
             "gap": [(time - before) / unit],
             "delta": [d / unit for d in delta],
-        }[age_input]
+        }[time_input]
         if mask.any() or update_rows == "every":
             h = gru_in_floats(model, h, [*values.tolist(), *map(float, mask.tolist()), *age])
         after.append(h)
@@ -272,7 +274,7 @@ def test_gru_is_equations_20_to_23_in_plain_floats(
 
 
 def gru_d_in_floats(
-    model: RecurrentModel, data: Dataset, *, decay_rows: str, update_rows: str
+    model: Model, data: Dataset, *, decay_rows: str, update_rows: str
 ) -> tuple[Tensor, Tensor]:
     """Equations 24 to 32, and the three meanings of a row at which the cell does not act.
 
@@ -378,7 +380,7 @@ def test_rnn_decay_multiplies_by_exp_of_minus_tau_times_the_gap(
     decay: str, decay_rows: str
 ) -> None:
     data = sample()
-    model = small_model("rnn_decay", decay=decay, age_input="none", decay_rows=decay_rows)
+    model = small_model("rnn_decay", decay=decay, time_input="none", decay_rows=decay_rows)
     tau = torch.log1p(torch.exp(model.decay.raw_tau.detach()))  # type: ignore[union-attr, operator]
     assert tau.shape == ((1,) if decay == "scalar" else (4,))
     h, before, time_before = torch.zeros(4).double(), [], 0.0
@@ -392,9 +394,7 @@ def test_rnn_decay_multiplies_by_exp_of_minus_tau_times_the_gap(
     assert error(states_of(model, data)[1], torch.stack(before)) < 1e-14
 
 
-def ode_rnn_by_torchdiffeq(
-    model: RecurrentModel, data: Dataset, method: str, **options: Any
-) -> Tensor:
+def ode_rnn_by_torchdiffeq(model: Model, data: Dataset, method: str, **options: Any) -> Tensor:
     """Algorithm 2: the gap that leads to an observation comes before its update."""
     h, before, time_before = torch.zeros(model.hidden_size).double(), [], 0.0
     with torch.no_grad():
@@ -619,8 +619,8 @@ def test_anchored_repeats_the_last_values_where_its_field_is_zero() -> None:
 def test_self_feeding_gru_takes_its_decoded_state_where_the_coin_says_so() -> None:
     data = sample()
     model = small_model(thesis_config("gru", self_feeding=0.5))
-    coins = torch.Generator().manual_seed(11)
-    drawn = [float(torch.rand((), generator=coins)) < 0.5 for _ in range(ROWS)]
+    generator = torch.Generator().manual_seed(11)
+    drawn = [float(torch.rand((), generator=generator)) < 0.5 for _ in range(ROWS)]
     drawn[0] = False
     assert len(set(drawn)) == 2
     h, expected, time_before = torch.zeros(4).double(), [], 0.0
@@ -636,7 +636,7 @@ def test_self_feeding_gru_takes_its_decoded_state_where_the_coin_says_so() -> No
                     torch.cat([shown, mask.double(), torch.tensor([gap], dtype=torch.float64)]),
                 )
             time_before = time
-    got = predictions(model, model.batch(data), coins=torch.Generator().manual_seed(11))
+    got = predictions(model, model.batch(data), generator=torch.Generator().manual_seed(11))
     assert error(got[0], torch.stack(expected)) < 1e-13
 
 
@@ -646,8 +646,8 @@ def test_self_feeding_gru_d_leaves_h_undecayed_at_hidden_rows_and_replaces_x_hat
 ) -> None:
     data = sample(whole_rows=whole_rows)
     model = small_model(thesis_config("gru_d", self_feeding=0.5))
-    coins = torch.Generator().manual_seed(3)
-    drawn = [float(torch.rand((), generator=coins)) < 0.5 for _ in range(ROWS)]
+    generator = torch.Generator().manual_seed(3)
+    drawn = [float(torch.rand((), generator=generator)) < 0.5 for _ in range(ROWS)]
     drawn[0] = False
     mean = torch.tensor(model.statistics.mean, dtype=torch.float64)
     model.mean.copy_(mean)
@@ -667,7 +667,7 @@ def test_self_feeding_gru_d_leaves_h_undecayed_at_hidden_rows_and_replaces_x_hat
                 h = gru_by_matrices(model, h, torch.cat([own if fed else x_hat, mask.double()]))
             last, delta = torch.where(mask, values, last), torch.where(mask, 0.0, delta)
             time_before = time
-    got = predictions(model, model.batch(data), coins=torch.Generator().manual_seed(3))
+    got = predictions(model, model.batch(data), generator=torch.Generator().manual_seed(3))
     assert error(got[0], torch.stack(expected)) < 1e-13
 
 
@@ -694,10 +694,10 @@ def test_one_coin_is_drawn_per_row_for_the_whole_batch_and_never_at_row_0() -> N
 
 def test_without_self_feeding_no_coin_is_drawn() -> None:
     model = small_model("gru")
-    coins = torch.Generator().manual_seed(1)
-    state = coins.get_state()
-    predictions(model, model.batch(sample()), coins=coins)
-    assert torch.equal(coins.get_state(), state)
+    generator = torch.Generator().manual_seed(1)
+    state = generator.get_state()
+    predictions(model, model.batch(sample()), generator=generator)
+    assert torch.equal(generator.get_state(), state)
 
 
 # --- where a prediction is read -------------------------------------------------------------------
@@ -709,7 +709,7 @@ def test_a_prediction_is_read_from_the_state_on_arrival_or_after_the_row_before(
     for readout in ("target", "last_row"):
         model = small_model(name, readout=readout)
         got, before, after = states_of(model, data)
-        start = model.empty_carry(1).state
+        start = model.empty_state(1).state
         states = before if readout == "target" else torch.cat([start, after[:-1]])
         with torch.no_grad():
             assert torch.equal(got, model.read(states))
@@ -718,19 +718,19 @@ def test_a_prediction_is_read_from_the_state_on_arrival_or_after_the_row_before(
 # --- gradients ------------------------------------------------------------------------------------
 
 
-def tiny(name: str, **options: Any) -> tuple[RecurrentModel, Batch]:
+def tiny(name: str, **options: Any) -> tuple[Model, Batch]:
     """Weights are positive where a maximum with 0 would bend the loss."""
     one = trajectory(2, 5, channels=2)
     observed = [[True, False], [False, False], [True, True], [False, True], [True, True]]
     data = Dataset((with_observed(one, observed),))
     sizes = {"hidden_size": 2, "decoder_units": (2,), "field_units": (2,), "typical_gap": 0.3}
-    model = make(name, data, **{**sizes, **options}).double()
+    model = make_model(name, data, **{**sizes, **options}).double()
     draw_weights(model, seed=4)
     with_growing_decays(model)
     return model, model.batch(data)
 
 
-def check_gradients(model: RecurrentModel, batch: Batch, *, fast: bool = False) -> None:
+def check_gradients(model: Model, batch: Batch, *, fast: bool = False) -> None:
     names = [name for name, _ in model.named_parameters()]
     weights = [p.detach().clone().requires_grad_() for p in model.parameters()]
 
@@ -752,7 +752,7 @@ def test_gradients_of_every_parameter_are_those_of_finite_differences(name: str)
     [
         ("gru_d", {"decay_rows": "every_row", "readout": "last_row"}),
         ("gru_d", {"self_feeding": 0.5, "decay_rows": "observed_rows", "readout": "last_row"}),
-        ("gru", {"reset_after": True, "update_rows": "every", "age_input": "delta"}),
+        ("gru", {"reset_after": True, "update_rows": "every", "time_input": "delta"}),
         ("ode_gru_d", {"solver": "rk4", "steps_per_gap": 2}),
         ("anchored_ode_gru_d", {"decay": "trainable", "max_step": 0.2}),
     ],
@@ -832,7 +832,7 @@ def test_milliseconds_taken_as_seconds_give_the_same_predictions(name: str) -> N
 
 def test_the_median_gap_of_training_is_the_typical_gap_in_model_time() -> None:
     train = dataset(6, seed=9)
-    model = make("ode_rnn", train, **{**SMALL, "typical_gap": 0.25})
+    model = make_model("ode_rnn", train, **{**SMALL, "typical_gap": 0.25})
     gaps = np.concatenate([np.diff(t.times) for t in train])
     assert 0.25 * model.time_unit in gaps
     assert (gaps <= 0.25 * model.time_unit).mean() == pytest.approx(0.5, abs=0.03)
@@ -844,20 +844,20 @@ def test_the_median_gap_of_training_is_the_typical_gap_in_model_time() -> None:
 @pytest.mark.parametrize("name", sorted(ZOO))
 def test_initial_weights_follow_from_the_seed(name: str) -> None:
     train = dataset(4)
-    first, again, other = (make(name, train, seed=s, **SMALL) for s in (1, 1, 2))
+    first, again, other = (make_model(name, train, seed=s, **SMALL) for s in (1, 1, 2))
     for (key, a), b in zip(first.named_parameters(), again.parameters(), strict=True):
         assert torch.equal(a, b), key
     assert any(
         not torch.equal(a, b) for a, b in zip(first.parameters(), other.parameters(), strict=True)
     )
     state = torch.get_rng_state()
-    make(name, train, **SMALL)
+    make_model(name, train, **SMALL)
     assert torch.equal(torch.get_rng_state(), state), "no global state is touched"
 
 
 @pytest.mark.parametrize("name", THESIS_MODELS)
 def test_weights_of_the_thesis_start_at_a_tenth_of_a_normal_and_biases_at_0(name: str) -> None:
-    model = make(thesis_config(name), dataset(6, seed=9, channels=14))
+    model = make_model(thesis_config(name), dataset(6, seed=9, channels=14))
     for key, parameter in model.named_parameters():
         if "bias" in key:
             assert not parameter.any(), key
@@ -874,7 +874,7 @@ def test_weights_of_the_thesis_start_at_a_tenth_of_a_normal_and_biases_at_0(name
 
 
 def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
-    model = make("anchored_ode_gru_d", dataset(6, seed=9, channels=14))
+    model = make_model("anchored_ode_gru_d", dataset(6, seed=9, channels=14))
     assert not model.start.any()  # type: ignore[union-attr]
     *inner, last = model.field.weights  # type: ignore[union-attr]
     assert [w.shape for w in (*inner, last)] == [(100, 46), (100, 100), (100, 100), (46, 100)]
@@ -902,7 +902,7 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
         ({"decay": "yes"}, "unknown model option decay 'yes'"),
         ({"decay_rows": "all"}, "unknown model option decay_rows"),
         ({"update_rows": "all"}, "unknown model option update_rows"),
-        ({"age_input": "age"}, "unknown model option age_input"),
+        ({"time_input": "age"}, "unknown model option time_input"),
         ({"readout": "here"}, "unknown model option readout"),
         ({"init": "xavier"}, "unknown model option init"),
         ({"gradient": "none"}, "unknown model option gradient"),
@@ -930,20 +930,20 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
 )
 def test_an_option_that_cannot_be_is_refused_by_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        make("gru", dataset(3), **options)
+        make_model("gru", dataset(3), **options)
 
 
 def test_an_unknown_model_is_refused_with_the_choices() -> None:
     with pytest.raises(InputError, match=r"unknown model 'gru-d'.*did you mean 'gru_d'"):
-        make("gru-d", dataset(2))
+        make_model("gru-d", dataset(2))
     with pytest.raises(InputError, match="unknown thesis model 'lstm'"):
         thesis_config("lstm")
 
 
 def test_a_model_built_from_an_open_config_says_what_is_open() -> None:
-    model = make("gru", dataset(2), **SMALL)
+    model = make_model("gru", dataset(2), **SMALL)
     with pytest.raises(InputError, match="left open: hidden_size"):
-        RecurrentModel(
+        Model(
             replace(model.config, hidden_size=None),
             model.statistics,
             scaler=model.scaler,
@@ -953,7 +953,7 @@ def test_a_model_built_from_an_open_config_says_what_is_open() -> None:
 
 
 def test_channels_that_are_not_the_models_are_refused() -> None:
-    model = make("gru", dataset(2), **SMALL)
+    model = make_model("gru", dataset(2), **SMALL)
     with pytest.raises(InputError, match="the batch has 2 channels, the model has 3"):
         model(Batch.of(dataset(2, channels=2)))
     for fields, message in (
@@ -969,7 +969,7 @@ def test_channels_that_are_not_the_models_are_refused() -> None:
 
 
 def test_channels_in_another_order_are_put_in_the_models() -> None:
-    model, data = make("gru", dataset(2), **SMALL), dataset(2)
+    model, data = make_model("gru", dataset(2), **SMALL), dataset(2)
     turned = [
         Trajectory(t.times, t.values[:, ::-1], observed=t.observed[:, ::-1], names=t.names[::-1])
         for t in data
@@ -984,14 +984,14 @@ def test_training_data_in_which_a_channel_is_never_observed_is_refused_by_name()
     observed = one.observed.copy()
     observed[:, 1] = False
     with pytest.raises(InputError, match="channel_1"):
-        make("gru", Dataset((with_observed(one, observed),)))
+        make_model("gru", Dataset((with_observed(one, observed),)))
     with pytest.raises(InputError, match="at least one trajectory of two rows"):
-        make("gru", Dataset((with_observed(one.slice(0, 1), True),)))
+        make_model("gru", Dataset((with_observed(one.slice(0, 1), True),)))
 
 
 def test_a_carry_without_a_generator_cannot_feed_itself() -> None:
     model = small_model("gru", self_feeding=0.5)
     batch = model.batch(sample())
-    carry = replace(model.empty_carry(1), coins=None)
+    carry = replace(model.empty_state(1), generator=None)
     with pytest.raises(InputError, match="the carry needs a generator"):
         model(batch, carry=carry)

@@ -19,15 +19,15 @@ from torch import Tensor
 from offbeat import (
     FileFormatError,
     InputError,
+    Model,
     OnnxStream,
-    RecurrentModel,
     Stream,
     export_onnx,
-    save_checkpoint,
+    save_model,
 )
-from offbeat.cli import main
-from offbeat.inference.onnx_runner import STATE
-from offbeat.inference.step import StreamStep
+from offbeat.cli.app import main
+from offbeat.export.runner import STATE
+from offbeat.export.step import StreamStep
 from offbeat.models.zoo import ZOO
 
 FIXED = [
@@ -39,7 +39,7 @@ EXPORTED = [*sorted(ZOO), "ode_gru_d-decay_rk4", "thesis-ode_gru_d", "gru_d-ever
 """The exporter takes seconds, so beside the zoo only what takes another way through the graph."""
 
 
-def made(name: str, dtype: torch.dtype = FLOAT32) -> RecurrentModel:
+def made(name: str, dtype: torch.dtype = FLOAT32) -> Model:
     if name == "ode_gru_d-decay_rk4":
         return small_model("ode_gru_d", dtype=dtype, solver="rk4", steps_per_gap=3)
     return build(name, dtype)
@@ -78,7 +78,7 @@ def test_the_step_written_out_says_what_a_stream_says(variant: str, dtype: torch
     times = one.times.copy()
     times[9:] += 0.3  # longer than the limit of the model's clock
     assert 4 * model.statistics.longest_elapsed < 0.3 or "max_step" in variant
-    step, carry = StreamStep(model), model.empty_carry(1)
+    step, carry = StreamStep(model), model.empty_state(1)
     state: tuple[Tensor, ...] = tuple(getattr(carry, name) for name in STATE)
     stream, got, expected = Stream(model), [], []
     for row in range(one.rows):
@@ -97,7 +97,7 @@ def test_the_step_written_out_says_what_a_stream_says(variant: str, dtype: torch
 # --- onnxruntime ----------------------------------------------------------------------------------
 
 
-def check_parity(model: RecurrentModel, live: OnnxStream, tolerance: float) -> None:
+def check_parity(model: Model, live: OnnxStream, tolerance: float) -> None:
     one, stream = trajectory(4, 14), Stream(model, time_unit="ns", late="reorder")
     ticks = np.round(one.times * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
     got, expected = [], []
@@ -215,7 +215,7 @@ def test_the_command_exports_and_the_stream_command_runs_the_file_without_torch(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     model, out = small_model("anchored_ode_gru_d", dtype=FLOAT32), tmp_path / "model.onnx"
-    save_checkpoint(model, tmp_path / "model")
+    save_model(model, tmp_path / "model")
     assert main(["export", str(tmp_path / "model"), str(out), "--to", "onnx", "--json"]) == 0
     captured = capfd.readouterr()
     assert captured.err == ""
@@ -224,7 +224,7 @@ def test_the_command_exports_and_the_stream_command_runs_the_file_without_torch(
     }  # fmt: skip
     code = (
         "import sys; sys.modules['torch'] = None\n"
-        "from offbeat.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from offbeat.cli.app import main; sys.exit(main(sys.argv[1:]))"
     )
     lines = b'{"t": 0.0, "values": {"channel_0": 1.0}}\n{"predict": 0.5}\n'
     call = [sys.executable, "-c", code, "stream", str(out)]
@@ -248,7 +248,7 @@ def test_the_command_exports_and_the_stream_command_runs_the_file_without_torch(
 def test_what_no_graph_can_do_is_refused_in_one_line(
     options: dict[str, Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_checkpoint(small_model("ode_rnn", **options), tmp_path / "model")
+    save_model(small_model("ode_rnn", **options), tmp_path / "model")
     assert main(["export", str(tmp_path / "model"), str(tmp_path / "out.onnx")]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1

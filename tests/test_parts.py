@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from offbeat import (
     Dataset,
     InputError,
-    PartsConfig,
     Scaler,
+    SplitConfig,
     Trajectory,
-    make,
-    parts,
+    apply_split,
+    make_model,
     split_in_time,
     windows,
 )
-from offbeat.data.prepare import load_parts, save_parts
+from offbeat.data.splits import load_split, save_split
 
 
 def log(rows: int = 1000, *, gap: float = 0.01, start: int = 0) -> Trajectory:
@@ -106,12 +106,14 @@ def test_episodes_in_order_are_one_log_and_the_one_at_a_border_is_cut():
 
 @given(st.integers(30, 300), st.integers(5, 40), st.sampled_from(["consecutive", "random"]))
 def test_no_window_straddles_and_all_of_training_comes_first(rows, window, cut):
-    config = PartsConfig(window=window, cut=cut, split="in_time", fractions=(0.5, 0.25, 0.25))
-    train, validation, test = parts(Dataset((log(rows),)), config)
+    config = SplitConfig(window=window, cut=cut, split="in_time", fractions=(0.5, 0.25, 0.25))
+    train, validation, test = apply_split(Dataset((log(rows),)), config)
     assert max(rows_of(train)) < min(rows_of(validation))
     assert max(rows_of(validation)) < min(rows_of(test))
-    held_out = [*rows_of(validation), *rows_of(test)]
-    assert held_out == list(range(held_out[0], rows)), "each row of them once, random or not"
+    validation_set = [*rows_of(validation), *rows_of(test)]
+    assert validation_set == list(range(validation_set[0], rows)), (
+        "each row of them once, random or not"
+    )
     for part in (train, validation, test):
         for one in part:
             assert np.array_equal(np.diff(one.values[:, 0]), np.ones(one.rows - 1))
@@ -123,11 +125,11 @@ def test_scales_and_statistics_come_from_the_training_part_alone():
         values[280:] = value * np.arange(120)[:, None]
         return Dataset((Trajectory(np.arange(400) * 0.01, values),))
 
-    config = PartsConfig(window=40, split="in_time", observed_fraction=0.5, hide="bursts")
-    cut = [parts(with_end(v), config)[0] for v in (1.0, 1e6)]
+    config = SplitConfig(window=40, split="in_time", observed_fraction=0.5, hide="bursts")
+    cut = [apply_split(with_end(v), config)[0] for v in (1.0, 1e6)]
     scalers = [Scaler.fit("standardise", c).to_dict() for c in cut]
     assert scalers[0] == scalers[1]
-    models = [make("gru", c, hidden_size=3) for c in cut]
+    models = [make_model("gru", c, hidden_size=3) for c in cut]
     assert models[0].statistics == models[1].statistics
 
 
@@ -135,7 +137,7 @@ def test_a_log_too_short_for_its_parts_says_what_to_do():
     with pytest.raises(InputError, match="use a longer log"):
         split_in_time(Dataset((log(5),)))
     with pytest.raises(InputError, match="split='in_time'"):
-        parts(Dataset((log(500),)), PartsConfig(window=10))
+        apply_split(Dataset((log(500),)), SplitConfig(window=10))
     with pytest.raises(InputError, match="sum to 1"):
         split_in_time(Dataset((log(50),)), (0.5, 0.2))
 
@@ -145,7 +147,7 @@ def test_a_log_too_short_for_its_parts_says_what_to_do():
 
 def test_all_windows_of_a_trajectory_stand_in_one_part():
     data = Dataset(tuple(log(50 + i, start=1000 * i) for i in range(20)))
-    three = parts(data, PartsConfig(window=12, cut="consecutive", seed=3))
+    three = apply_split(data, SplitConfig(window=12, cut="consecutive", seed=3))
     owners = [{v // 1000 for v in rows_of(part)} for part in three]
     assert [len(o) for o in owners] == [14, 3, 3]
     assert set.union(*owners) == set(range(20))
@@ -154,8 +156,8 @@ def test_all_windows_of_a_trajectory_stand_in_one_part():
 @pytest.mark.parametrize("hide", ["rows", "cells", "bursts", "dropout"])
 def test_shares_hold_for_a_trajectory_that_is_cut_into_several_windows(hide):
     data = Dataset(tuple(log(100, start=1000 * i) for i in range(10)))
-    config = PartsConfig(window=30, cut="consecutive", observed_fraction=0.4, hide=hide)
-    for part in parts(data, config):
+    config = SplitConfig(window=30, cut="consecutive", observed_fraction=0.4, hide=hide)
+    for part in apply_split(data, config):
         seen: dict[int, int] = {}
         for one in part:
             owner = int(one.values[0, 0]) // 1000
@@ -166,9 +168,9 @@ def test_shares_hold_for_a_trajectory_that_is_cut_into_several_windows(hide):
 @pytest.mark.parametrize(
     "config",
     [
-        PartsConfig(window_s=0.3, split="in_time", observed_fraction=0.6, hide="cells", seed=4),
-        PartsConfig(window=20, cut="random", window_count=3, split="in_time"),
-        PartsConfig(
+        SplitConfig(window_s=0.3, split="in_time", observed_fraction=0.6, hide="cells", seed=4),
+        SplitConfig(window=20, cut="random", window_count=3, split="in_time"),
+        SplitConfig(
             split="in_time", observed_fraction=0.5, hide="dropout", burst_s=0.1,
             sensors=[["channel_0"]],
         ),
@@ -176,13 +178,13 @@ def test_shares_hold_for_a_trajectory_that_is_cut_into_several_windows(hide):
 )  # fmt: skip
 def test_parts_come_back_from_their_file(tmp_path, config):
     data = Dataset((log(300),))
-    save_parts(tmp_path / "parts.json", config, data)
-    again = load_parts(tmp_path / "parts.json", data)
+    save_split(tmp_path / "split.json", config, data)
+    again = load_split(tmp_path / "split.json", data)
     assert again is not None
-    for a, b in zip(parts(data, config), again, strict=True):
+    for a, b in zip(apply_split(data, config), again, strict=True):
         assert [t.times.tolist() for t in a] == [t.times.tolist() for t in b]
         assert all(np.array_equal(x.observed, y.observed) for x, y in zip(a, b, strict=True))
-    assert load_parts(tmp_path / "parts.json", Dataset((log(301),))) is None
+    assert load_split(tmp_path / "split.json", Dataset((log(301),))) is None
 
 
 @pytest.mark.parametrize(
@@ -200,10 +202,10 @@ def test_parts_come_back_from_their_file(tmp_path, config):
 )
 def test_a_config_that_contradicts_itself_is_refused(options, message):
     with pytest.raises(InputError, match=message):
-        PartsConfig(**options)
+        SplitConfig(**options)
 
 
 def test_a_config_is_plain_data():
-    config = PartsConfig(hide="dropout", sensors=[["a", "b"], ["c"]])
+    config = SplitConfig(hide="dropout", sensors=[["a", "b"], ["c"]])
     assert config.sensors == (("a", "b"), ("c",))
-    assert PartsConfig(**asdict(config)) == config
+    assert SplitConfig(**asdict(config)) == config

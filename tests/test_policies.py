@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from offbeat.data import mend
-from offbeat.data.policies import sentences
-from offbeat.data.recording import Policies, Recording, Signal, assemble
+from offbeat.data.cleaning import channels as mend
+from offbeat.data.cleaning.options import sentences
+from offbeat.data.recording import ReaderOptions, Recording, Signal, assemble
 from offbeat.errors import FileFormatError, InputError
 
 MS = 1_000_000
@@ -27,7 +27,7 @@ def signal(stamps_ms, *columns, name="", channels=None, **fields):
 
 
 def built(*signals, policies=None, **options):
-    return assemble([Recording(signals)], policies or Policies(**options))
+    return assemble([Recording(signals)], policies or ReaderOptions(**options))
 
 
 def report(dataset):
@@ -303,7 +303,7 @@ class TestHeldValues:
             Recording((signal(range(0, 60, 5), np.repeat(np.arange(3.0) + 10 * i, 4)),))
             for i in range(6)
         ]
-        dataset = assemble(parts, Policies(held="mask"))
+        dataset = assemble(parts, ReaderOptions(held="mask"))
         assert report(dataset)["held"]["channels"]["x"]["rows_per_value"] == 4
         assert all(t.known.sum() == 3 for t in dataset)
 
@@ -487,7 +487,7 @@ def test_the_report_is_json_with_every_policy_and_notes_are_said_once():
 )
 def test_policies_that_are_none_are_refused(options, message):
     with pytest.raises(InputError, match=message):
-        Policies(**options)
+        ReaderOptions(**options)
 
 
 @pytest.mark.parametrize(

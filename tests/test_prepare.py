@@ -12,7 +12,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from model_helpers import dataset, trajectory
 
-from offbeat import Dataset, InputError, Scaler, Trajectory, split, thin, windows
+from offbeat import Dataset, InputError, Scaler, Trajectory, split, windows
+from offbeat.data.masking import mask_out
 
 NAN = float("nan")
 KINDS = ("standardise", "min_max", "divide_by_max", "identity")
@@ -50,7 +51,7 @@ def test_starts_of_windows_are_uniform_from_0_to_rows_minus_length() -> None:
 
 
 def test_windows_follow_from_the_seed_and_keep_masks_and_facts() -> None:
-    data = thin(numbered(30, 20), 0.5)
+    data = mask_out(numbered(30, 20), 0.5)
     first, again, other = (windows(data, 10, seed=s) for s in (1, 1, 2))
     assert all(np.array_equal(a.times, b.times) for a, b in zip(first, again, strict=True))
     assert any(not np.array_equal(a.times, b.times) for a, b in zip(first, other, strict=True))
@@ -140,47 +141,47 @@ def test_exactly_the_asked_share_of_rows_stays_observed(rows: int, thousandths: 
     full = Dataset((Trajectory(data[0].times, data[0].values),))
     if expected == 0:
         with pytest.raises(InputError, match="leaves none"):
-            thin(full, fraction)
+            mask_out(full, fraction)
         return
-    assert int(thin(full, fraction)[0].observed.any(axis=1).sum()) == expected
+    assert int(mask_out(full, fraction)[0].observed.any(axis=1).sum()) == expected
 
 
 @pytest.mark.parametrize("fraction", [0.9, 0.7, 0.5, 0.3])
 def test_the_fractions_of_the_thesis_keep_int_100_p_whole_rows(fraction: float) -> None:
     data = numbered(5, 100)
     data = Dataset(tuple(Trajectory(t.times, np.repeat(t.values, 3, axis=1)) for t in data))
-    for one in thin(data, fraction, seed=1):
+    for one in mask_out(data, fraction, seed=1):
         assert one.observed.all(axis=1).sum() == int(100 * fraction)
         assert np.array_equal(one.observed.all(axis=1), one.observed.any(axis=1))
 
 
 def test_hidden_cells_stay_known_and_nothing_else_changes() -> None:
     data = numbered(3, 40)
-    for thinned, whole in zip(thin(data, 0.3, seed=2), data, strict=True):
-        assert np.array_equal(thinned.values, whole.values)
-        assert np.array_equal(thinned.times, whole.times)
-        assert thinned.known.all()
-    assert not np.array_equal(*(thin(data, 0.3, seed=2)[i].observed for i in (0, 1)))
+    for masked, whole in zip(mask_out(data, 0.3, seed=2), data, strict=True):
+        assert np.array_equal(masked.values, whole.values)
+        assert np.array_equal(masked.times, whole.times)
+        assert masked.known.all()
+    assert not np.array_equal(*(mask_out(data, 0.3, seed=2)[i].observed for i in (0, 1)))
 
 
 def test_thinning_keeps_masks_per_channel_and_counts_observed_rows_alone() -> None:
     data = dataset(5, rows=40)
-    for thinned, whole in zip(thin(data, 0.5, seed=4), data, strict=True):
-        rows = thinned.observed.any(axis=1)
+    for masked, whole in zip(mask_out(data, 0.5, seed=4), data, strict=True):
+        rows = masked.observed.any(axis=1)
         assert rows.sum() == whole.observed.any(axis=1).sum() // 2
-        assert np.array_equal(thinned.observed[rows], whole.observed[rows])
+        assert np.array_equal(masked.observed[rows], whole.observed[rows])
 
 
 def test_every_row_is_as_likely_to_stay() -> None:
     data = Dataset((numbered(1, 10)[0],) * 3000)
-    counts = sum(t.observed[:, 0].astype(int) for t in thin(data, 0.3, seed=0))
+    counts = sum(t.observed[:, 0].astype(int) for t in mask_out(data, 0.3, seed=0))
     # Five standard deviations of a binomial count around 900.
     assert np.abs(counts - 900).max() < 5 * np.sqrt(3000 * 0.3 * 0.7)
 
 
 def test_thinning_follows_from_the_seed_and_is_told_in_the_facts() -> None:
     data = numbered(3, 50)
-    first, again, other = (thin(data, 0.5, seed=s) for s in (1, 1, 2))
+    first, again, other = (mask_out(data, 0.5, seed=s) for s in (1, 1, 2))
     masks = [np.stack([t.observed for t in d]) for d in (first, again, other)]
     assert np.array_equal(masks[0], masks[1])
     assert not np.array_equal(masks[0], masks[2])
@@ -191,15 +192,15 @@ def test_thinning_follows_from_the_seed_and_is_told_in_the_facts() -> None:
 @pytest.mark.parametrize("fraction", [0, 0.0, 1.2, -0.3, NAN, float("inf")])
 def test_a_fraction_outside_0_to_1_is_refused(fraction: float) -> None:
     with pytest.raises(InputError, match="above 0 and at most 1"):
-        thin(numbered(2, 10), fraction)
+        mask_out(numbered(2, 10), fraction)
 
 
 def test_a_trajectory_too_short_to_keep_a_row_is_refused() -> None:
     with pytest.raises(InputError, match="of the 3 observed rows of trajectory 0 leaves none"):
-        thin(numbered(2, 3), 0.3)
+        mask_out(numbered(2, 3), 0.3)
     hidden = Trajectory([0.0, 1.0], [[1.0], [2.0]], observed=np.zeros((2, 1), dtype=bool))
     with pytest.raises(InputError, match="of the 0 observed rows of trajectory 0 leaves none"):
-        thin(Dataset((hidden,)), 1.0)
+        mask_out(Dataset((hidden,)), 1.0)
 
 
 # --- scalers --------------------------------------------------------------------------------------

@@ -12,13 +12,13 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from offbeat.data.clock import TIME_NAMES
+from offbeat.data.cleaning.clocks import TIME_NAMES
 from offbeat.data.readers import READERS, Reader, read, register
 from offbeat.data.readers.columns import LABEL_NAMES
 from offbeat.data.readers.table import MISSING
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.data.writers import write_table
+from offbeat.data.writers.tables import write_table
 from offbeat.errors import FileFormatError, InputError
 
 

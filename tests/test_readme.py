@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from offbeat.cli import COMMANDS, main
+from offbeat.cli.app import COMMANDS, main
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 

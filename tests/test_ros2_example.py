@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from model_helpers import small_model
 
-from offbeat import Dataset, Stream, Trajectory, save_checkpoint
+from offbeat import Dataset, Stream, Trajectory, save_model
 
 PATH = Path(__file__).parents[1] / "examples" / "ros2_node.py"
 CHANNELS = ("position.hip", "velocity.hip", "position.knee", "torso.height")
@@ -80,7 +80,7 @@ def test_a_message_is_answered_with_what_the_stream_predicts_after_it(
     node: Any, tmp_path: Path
 ) -> None:
     model = arm()
-    save_checkpoint(model, tmp_path / "model")
+    save_model(model, tmp_path / "model")
     live, joints = node.load(str(tmp_path / "model")), node.JointChannels(CHANNELS)
     plain = Stream(model, time_unit="ns", late="reorder")
     start = 1_700_000_000

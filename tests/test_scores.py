@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import offbeat as ob
 from offbeat.data.batch import Batch
-from offbeat.scores import Scores, ScoreSums, last_value_predictions, row_0_constant, table
+from offbeat.metrics import Scores, ScoreSums, last_value_predictions, row_0_constant, table
 
 
 def trajectory(values, observed=None, times=None):
@@ -33,12 +33,12 @@ def test_each_scoring_counts_the_cells_it_names():
     error = torch.tensor([[[1.0, 2.0], [3.0, 5.0], [7.0, 11.0], [13.0, 17.0]]])
     scores = scores_of(batch, batch.values + error)
     # honest: channel 0 at rows 2 and 3, channel 1 at row 3
-    assert scores.honest.cells == 3
-    assert scores.honest.mse == pytest.approx((7**2 + 13**2 + 17**2) / 3)
-    assert scores.honest.per_channel == pytest.approx(((7**2 + 13**2) / 2, 17**2))
-    assert scores.honest_hidden.mse == pytest.approx((13**2 + 17**2) / 2)
+    assert scores.after_first_observation.cells == 3
+    assert scores.after_first_observation.mse == pytest.approx((7**2 + 13**2 + 17**2) / 3)
+    assert scores.after_first_observation.per_channel == pytest.approx(((7**2 + 13**2) / 2, 17**2))
+    assert scores.masked.mse == pytest.approx((13**2 + 17**2) / 2)
     later = 3**2 + 5**2 + 7**2 + 11**2 + 13**2 + 17**2
-    assert scores.rows_1_99.mse == pytest.approx(later / 6)
+    assert scores.after_first_row.mse == pytest.approx(later / 6)
     # published: row 0 is hidden, so its error is the value itself, whatever was predicted
     assert scores.published.mse == pytest.approx((later + 1**2 + 2**2) / 8)
 
@@ -61,7 +61,7 @@ def test_published_is_rows_1_99_plus_the_constant_of_the_hidden_first_rows(seed,
     scores = scores_of(batch, torch.from_numpy(random.normal(size=(n, rows, 3))))
     hidden = float((~batch.mask[:, 0, 0]).double().mean())
     constant = row_0_constant(batch) if hidden else 0.0
-    expected = (1 - 1 / rows) * scores.rows_1_99.mse + constant * hidden / rows
+    expected = (1 - 1 / rows) * scores.after_first_row.mse + constant * hidden / rows
     assert scores.published.mse == pytest.approx(expected, rel=1e-12)
 
 
@@ -71,8 +71,10 @@ def test_cells_that_are_not_known_and_padding_count_nowhere():
     batch = Batch.of([long, short], dtype=torch.float64)
     scores = scores_of(batch, torch.full((2, 3, 2), 1e3))
     assert scores.published.cells == 5 + 4
-    assert scores.rows_1_99.cells == 4 + 2
-    assert scores.honest.cells == 2 + 1 + 2  # channel 1 of the long one is first seen in row 1
+    assert scores.after_first_row.cells == 4 + 2
+    assert (
+        scores.after_first_observation.cells == 2 + 1 + 2
+    )  # channel 1 of the long one is first seen in row 1
 
 
 def test_parts_add_up_to_the_whole():
@@ -87,7 +89,9 @@ def test_parts_add_up_to_the_whole():
     for part in (slice(0, 3), slice(3, 7)):
         sums.add(predictions[part], batch.take(part))
     split = sums.scores()
-    assert split.honest.mse == pytest.approx(whole.honest.mse, rel=1e-12)
+    assert split.after_first_observation.mse == pytest.approx(
+        whole.after_first_observation.mse, rel=1e-12
+    )
     assert split.by_gap[0].score.cells == whole.by_gap[0].score.cells
 
 
@@ -114,8 +118,8 @@ def test_the_last_value_predictor_repeats_what_was_seen_and_starts_from_the_mean
 def test_a_score_without_cells_is_nan_and_null_in_json():
     batch = Batch.of([trajectory([[1.0], [2.0]], [[False], [False]])])
     scores = scores_of(batch, torch.zeros(1, 2, 1))
-    assert math.isnan(scores.honest.mse)
-    assert scores.to_dict()["honest"]["mse"] is None
+    assert math.isnan(scores.after_first_observation.mse)
+    assert scores.to_dict()["after_first_observation"]["mse"] is None
 
 
 def test_the_table_ranks_by_the_honest_score_and_shows_every_note():

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from offbeat.errors import DivergenceError, InputError
-from offbeat.solvers import TABLEAUS, Tableau, solve, solve_adaptive, solve_fixed, tableau
-from offbeat.solvers.adaptive import adaptive_steps
+from offbeat.ode import TABLEAUS, Tableau, solve, solve_adaptive, solve_fixed, tableau
+from offbeat.ode.adaptive import adaptive_steps
 
 ALL = sorted(TABLEAUS)
 ADAPTIVE = [name for name in ALL if TABLEAUS[name].adaptive]

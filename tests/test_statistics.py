@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
 
-from offbeat.errors import InputError
-from offbeat.report.statistics import (
+from offbeat.comparison.statistics import (
     bartlett,
     bca,
     critical_difference,
@@ -30,7 +29,8 @@ from offbeat.report.statistics import (
     welch_t,
     wilcoxon,
 )
-from offbeat.report.statistics.paired import small_sample_correction
+from offbeat.comparison.statistics.paired import small_sample_correction
+from offbeat.errors import InputError
 
 # Weights of eleven men, Shapiro and Wilk (1965), section 5: W = 0.79.
 WEIGHTS = [148, 154, 158, 160, 161, 162, 166, 170, 182, 195, 236]

@@ -20,7 +20,7 @@ from offbeat import (
     DivergenceError,
     InputError,
     Stream,
-    StreamPolicies,
+    StreamOptions,
     Trajectory,
     predict,
 )
@@ -158,7 +158,7 @@ def test_a_stream_starts_anew_after_a_reset() -> None:
     assert stream.counters.resets == 1
     assert stream.counters.rows == 2 * one.rows
     other = Stream(model, seed=4)
-    assert not np.array_equal(streamed(other, one), first), "other coins"
+    assert not np.array_equal(streamed(other, one), first), "other generator"
 
 
 def test_a_state_that_left_the_finite_numbers_says_so() -> None:
@@ -340,9 +340,9 @@ def test_a_policy_out_of_its_range_is_refused(options: dict[str, Any]) -> None:
 
 
 def test_policies_may_come_as_one_record_with_some_replaced() -> None:
-    policies = StreamPolicies(late="reorder", confirm=7)
+    policies = StreamOptions(late="reorder", confirm=7)
     stream = Stream(small_model("gru"), policies, reorder_rows=4)
-    assert stream.policies == StreamPolicies(late="reorder", confirm=7, reorder_rows=4)
+    assert stream.policies == StreamOptions(late="reorder", confirm=7, reorder_rows=4)
     with pytest.raises(InputError, match="unknown time unit 'h'"):
         Stream(small_model("gru"), time_unit="h")
 

@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 from model_helpers import small_model, trajectory
 from stream_helpers import Recorded, batch_predictions, message
 
-from offbeat import Stream, load_checkpoint, save_checkpoint
-from offbeat.cli import main
-from offbeat.inference.latency import Latency
-from offbeat.inference.lines import LineSession
-from offbeat.inference.pipes import LONGEST_LINE, serve
+from offbeat import Stream, load_model, save_model
+from offbeat.cli.app import main
+from offbeat.stream.latency import Latency
+from offbeat.stream.lines import LineSession
+from offbeat.stream.pipes import LONGEST_LINE, serve
 
 
 def ask(session: LineSession, line: Any) -> Any:
@@ -229,7 +229,7 @@ def test_a_line_without_an_end_fills_no_memory(length: int) -> None:
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("stream") / "model"
-    save_checkpoint(small_model("gru_d"), path)
+    save_model(small_model("gru_d"), path)
     return path
 
 
@@ -247,7 +247,7 @@ def rows(one: Any, which: range) -> bytes:
 def test_the_command_answers_every_line_and_goes_on_where_it_stopped(
     checkpoint: Path, tmp_path: Path
 ) -> None:
-    """Policies, horizon, statistics; the state is kept in a file between two runs."""
+    """ReaderOptions, horizon, statistics; the state is kept in a file between two runs."""
     one, state = trajectory(4, 12), tmp_path / "state.json"
     arguments = (checkpoint, "--state", state, "--stats", "--policies.late=reorder")
     answers = []
@@ -259,7 +259,7 @@ def test_the_command_answers_every_line_and_goes_on_where_it_stopped(
     assert "no JSON" in answers.pop(7)["error"]
     got = [list(a["prediction"].values()) for a in answers]
     np.testing.assert_allclose(
-        got, batch_predictions(load_checkpoint(checkpoint), one), rtol=0, atol=1e-12
+        got, batch_predictions(load_model(checkpoint), one), rtol=0, atol=1e-12
     )
     stats = json.loads(err)
     assert (stats["lines"], stats["bad_lines"], stats["answers_heard_to_the_end"]) == (5, 0, True)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from model_helpers import dataset
 
-from offbeat import Dataset, InputError, Trajectory, thin
-from offbeat.data.thin import hidden_cells, sensors_of
+from offbeat import Dataset, InputError, Trajectory
+from offbeat.data.masking import mask_out, masked_values, sensors_of
 
 
 def grid(rows: int, channels: int = 2, *, count: int = 1, gap: float = 0.005) -> Dataset:
@@ -44,14 +44,14 @@ def test_bursts_hide_exactly_the_asked_share_of_rows(rows, percent, length):
     data = grid(rows)
     if keep == 0:
         with pytest.raises(InputError, match="leaves none"):
-            thin(data, percent / 100, hide="bursts", burst_rows=length)
+            mask_out(data, percent / 100, hide="bursts", burst_rows=length)
         return
     wanted = -(-(rows - keep) // length)
     if wanted > keep + 1:
         with pytest.raises(InputError, match="use longer bursts"):
-            thin(data, percent / 100, hide="bursts", burst_rows=length)
+            mask_out(data, percent / 100, hide="bursts", burst_rows=length)
         return
-    (one,) = thin(data, percent / 100, hide="bursts", burst_rows=length)
+    (one,) = mask_out(data, percent / 100, hide="bursts", burst_rows=length)
     seen = one.observed.any(axis=1)
     assert np.array_equal(one.observed, np.repeat(seen[:, None], 2, axis=1))
     assert int(seen.sum()) == keep
@@ -65,7 +65,7 @@ def test_cells_keep_exactly_the_asked_share_of_every_channel(rows, percent, seed
     random = np.random.default_rng(seed)
     values = np.where(random.random((rows, 3)) < 0.6, random.normal(size=(rows, 3)), np.nan)
     data = Dataset((Trajectory(np.arange(rows) * 0.1, values),))
-    (one,) = thin(data, percent / 100, hide="cells", seed=seed)
+    (one,) = mask_out(data, percent / 100, hide="cells", seed=seed)
     before = data[0].observed.sum(axis=0)
     expected = np.minimum(np.maximum(before * percent // 100, 1), before)
     assert np.array_equal(one.observed.sum(axis=0), expected)
@@ -80,9 +80,9 @@ def test_dropout_keeps_exactly_the_asked_share_of_every_sensor(rows, percent, le
     too_short = any(-(-(n - k) // length) > k + 1 for n, k in zip(counts, keep, strict=True))
     if too_short:
         with pytest.raises(InputError, match="lie apart"):
-            thin(data, fraction, hide="dropout", burst_rows=length, seed=seed)
+            mask_out(data, fraction, hide="dropout", burst_rows=length, seed=seed)
         return
-    (one,) = thin(data, fraction, hide="dropout", burst_rows=length, seed=seed)
+    (one,) = mask_out(data, fraction, hide="dropout", burst_rows=length, seed=seed)
     assert one.observed[:, 0].sum() == keep[0]
     assert np.array_equal(one.observed[:, 0], one.observed[:, 1]), "one sensor, one silence"
     assert one.observed[:, 2].sum() == keep[1]
@@ -93,12 +93,12 @@ def test_dropout_keeps_exactly_the_asked_share_of_every_sensor(rows, percent, le
 @pytest.mark.parametrize("hide", ["rows", "cells", "bursts", "dropout"])
 def test_hidden_values_stay_known_and_the_seed_alone_decides(hide):
     data = dataset(4, rows=30)
-    first, again, other = (thin(data, 0.5, hide=hide, seed=s) for s in (1, 1, 2))
+    first, again, other = (mask_out(data, 0.5, hide=hide, seed=s) for s in (1, 1, 2))
     for a, b, whole in zip(first, again, data, strict=True):
         assert np.array_equal(a.values, whole.values)
         assert np.array_equal(a.observed, b.observed)
         assert not (a.observed & ~whole.observed).any()
-        assert np.array_equal(hidden_cells(a), whole.known & ~a.observed)
+        assert np.array_equal(masked_values(a), whole.known & ~a.observed)
     assert any(
         not np.array_equal(a.observed, b.observed) for a, b in zip(first, other, strict=True)
     )
@@ -111,7 +111,7 @@ def test_a_burst_in_seconds_hides_what_lies_within_that_time():
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(0.001, 0.05, 400))
     data = Dataset((Trajectory(times, np.arange(400.0)[:, None]),))
-    (one,) = thin(data, 0.6, hide="bursts", burst_s=0.2, seed=3)
+    (one,) = mask_out(data, 0.6, hide="bursts", burst_s=0.2, seed=3)
     seen = one.observed[:, 0]
     assert seen.sum() == 240
     starts = np.flatnonzero(~seen & np.concatenate([[True], seen[:-1]]))
@@ -123,18 +123,18 @@ def test_a_burst_in_seconds_hides_what_lies_within_that_time():
 
 
 def test_a_burst_of_50_ms_on_a_grid_of_5_ms_is_10_rows_wherever_it_starts():
-    (one,) = thin(grid(1000), 0.5, hide="bursts", burst_s=0.05)
+    (one,) = mask_out(grid(1000), 0.5, hide="bursts", burst_s=0.05)
     assert runs(~one.observed[:, 0]) == [10] * 50
 
 
 def test_without_a_length_there_is_one_silence():
-    (one,) = thin(grid(50), 0.4, hide="bursts", seed=5)
+    (one,) = mask_out(grid(50), 0.4, hide="bursts", seed=5)
     assert runs(~one.observed[:, 0]) == [30]
 
 
 def test_bursts_stand_anywhere_with_the_same_probability():
     data = grid(11, 1, count=4000)
-    starts = [int(np.argmin(t.observed[:, 0])) for t in thin(data, 6 / 11, hide="bursts")]
+    starts = [int(np.argmin(t.observed[:, 0])) for t in mask_out(data, 6 / 11, hide="bursts")]
     counts = np.bincount(starts, minlength=7)
     assert len(counts) == 7
     # Five standard deviations of a binomial count around 4000 / 7.
@@ -150,7 +150,7 @@ def test_channels_with_one_mask_are_one_sensor():
 
 
 def test_named_sensors_fall_silent_together_and_the_others_never():
-    (one,) = thin(
+    (one,) = mask_out(
         grid(40, 4), 0.5, hide="dropout", burst_rows=5, sensors=[["d", "a"], ["c"]], seed=1
     )
     assert np.array_equal(one.observed[:, 0], one.observed[:, 3])
@@ -175,4 +175,4 @@ def test_named_sensors_fall_silent_together_and_the_others_never():
 )
 def test_what_cannot_be_hidden_so_is_refused(options, message):
     with pytest.raises(InputError, match=message):
-        thin(grid(20), 0.3, **options)
+        mask_out(grid(20), 0.3, **options)

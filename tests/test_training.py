@@ -34,7 +34,7 @@ TRAIN, VALIDATION = swinging(12, seed=1), swinging(5, seed=2)
 SMALL = {"hidden_size": 4, "field_units": (8,), "decoder_units": (8,)}
 
 
-def weights(model: ob.RecurrentModel) -> dict[str, torch.Tensor]:
+def weights(model: ob.Model) -> dict[str, torch.Tensor]:
     return {name: value.clone() for name, value in model.state_dict().items()}
 
 
@@ -44,7 +44,7 @@ def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
 
 @pytest.mark.parametrize("name", sorted(ZOO))
 def test_a_few_epochs_lower_the_loss_of_every_model(name):
-    model = ob.make(name, TRAIN, seed=0)
+    model = ob.make_model(name, TRAIN, seed=0)
     config = train_config(name, epochs=8, batch_size=4, learning_rate=0.01)
     history = ob.fit(model, TRAIN, config=config, progress=False).history
     assert history[-1].train_mse < history[0].train_mse
@@ -54,18 +54,18 @@ def test_a_few_epochs_lower_the_loss_of_every_model(name):
 def test_every_optimizer_trains_and_the_same_seed_gives_the_same_weights(optimizer):
     results = []
     for _ in range(2):
-        model = ob.make("gru", TRAIN, **SMALL)
+        model = ob.make_model("gru", TRAIN, **SMALL)
         config = ob.TrainConfig(epochs=2, batch_size=5, optimizer=optimizer, clip_norm=0.5)
         ob.fit(model, TRAIN, config=config, progress=False)
         results.append(weights(model))
     assert same(*results)
-    assert not same(results[0], weights(ob.make("gru", TRAIN, **SMALL)))
+    assert not same(results[0], weights(ob.make_model("gru", TRAIN, **SMALL)))
 
 
 def test_the_seed_changes_the_order_of_the_batches():
     ends = []
     for seed in (0, 1):
-        model = ob.make("gru", TRAIN, **SMALL)
+        model = ob.make_model("gru", TRAIN, **SMALL)
         config = ob.TrainConfig(epochs=1, batch_size=5, seed=seed)
         ob.fit(model, TRAIN, config=config, progress=False)
         ends.append(weights(model))
@@ -73,11 +73,11 @@ def test_the_seed_changes_the_order_of_the_batches():
 
 
 def test_cosine_decay_ends_near_zero_and_clipping_bounds_an_sgd_step():
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     config = ob.TrainConfig(epochs=2, batch_size=12, schedule="cosine", learning_rate=0.1)
     history = ob.fit(model, TRAIN, config=config, progress=False).history
     assert history[-1].learning_rate == pytest.approx(0.05)  # the last of two steps
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     before = torch.cat([p.detach().flatten() for p in model.parameters()])
     config = ob.TrainConfig(
         epochs=1, batch_size=12, optimizer="sgd", learning_rate=1.0, clip_norm=0.01, loss_scale=1e4
@@ -88,7 +88,7 @@ def test_cosine_decay_ends_near_zero_and_clipping_bounds_an_sgd_step():
 
 
 def test_the_log_has_a_line_per_epoch_with_the_validation_scores(tmp_path):
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     result = ob.fit(
         model,
         TRAIN,
@@ -102,7 +102,9 @@ def test_the_log_has_a_line_per_epoch_with_the_validation_scores(tmp_path):
     assert [int(line["epoch"]) for line in lines] == [1, 2, 3]
     assert [int(line["steps"]) for line in lines] == [3, 6, 9]
     scores = ob.evaluate(model, VALIDATION).scores["gru"]
-    assert float(lines[-1]["validation_honest_mse"]) == pytest.approx(scores.honest.mse, rel=1e-6)
+    assert float(lines[-1]["validation_mse"]) == pytest.approx(
+        scores.after_first_observation.mse, rel=1e-6
+    )
     assert float(lines[-1]["validation_published_mse"]) == pytest.approx(
         scores.published.mse, rel=1e-6
     )
@@ -112,19 +114,19 @@ def test_the_log_has_a_line_per_epoch_with_the_validation_scores(tmp_path):
 
 
 def test_early_stopping_stops_and_keep_best_leaves_the_best_weights():
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     config = ob.TrainConfig(epochs=60, batch_size=4, learning_rate=0.3, patience=2, keep="best")
     result = ob.fit(model, TRAIN, VALIDATION, config, progress=False)
     assert result.stopped_early
     assert len(result.history) < 60
-    best = min(record.validation_honest_mse for record in result.history)
-    final = ob.evaluate(model, VALIDATION).scores["gru"].honest.mse
+    best = min(record.validation_mse for record in result.history)
+    final = ob.evaluate(model, VALIDATION).scores["gru"].after_first_observation.mse
     assert final == pytest.approx(best, rel=1e-6)
-    assert result.history[-1].validation_honest_mse > best
+    assert result.history[-1].validation_mse > best
 
 
 def test_early_stopping_without_a_validation_part_is_refused():
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     with pytest.raises(ob.InputError, match="validation part"):
         ob.fit(model, TRAIN, config=ob.TrainConfig(patience=3))
 
@@ -135,7 +137,7 @@ from pathlib import Path
 sys.path.insert(0, {tests!r})
 import offbeat as ob
 from test_training import SMALL, TRAIN, VALIDATION
-model = ob.make({name!r}, TRAIN, **{options!r})
+model = ob.make_model({name!r}, TRAIN, **{options!r})
 ob.fit(model, TRAIN, VALIDATION, ob.TrainConfig(**{config!r}), out=Path({out!r}), progress=False)
 """
 
@@ -153,7 +155,7 @@ def test_a_run_killed_in_the_middle_of_an_epoch_ends_as_if_it_had_not_been(
     options = {**SMALL, **options}
     # 12 steps per epoch, a checkpoint after every fifth: some of them inside an epoch.
     config = {"epochs": 40, "batch_size": 1, "checkpoint_every": 5, **config}
-    whole = ob.make(name, TRAIN, **options)
+    whole = ob.make_model(name, TRAIN, **options)
     expected = ob.fit(whole, TRAIN, VALIDATION, ob.TrainConfig(**config), progress=False)
 
     out = tmp_path / "run"
@@ -173,56 +175,62 @@ def test_a_run_killed_in_the_middle_of_an_epoch_ends_as_if_it_had_not_been(
     assert middle is not None
     assert not (out / "model").exists()
 
-    resumed = ob.make(name, TRAIN, **options)
+    resumed = ob.make_model(name, TRAIN, **options)
     result = ob.fit(resumed, TRAIN, VALIDATION, ob.TrainConfig(**config), out=out, progress=False)
     assert same(weights(resumed), weights(whole))
     strip = [replace(record, seconds=0.0) for record in result.history]
     assert strip == [replace(record, seconds=0.0) for record in expected.history]
-    assert same(weights(ob.load_checkpoint(out)), weights(whole))
+    assert same(weights(ob.load_model(out)), weights(whole))
 
 
 def test_a_finished_run_is_not_trained_again(tmp_path):
     config = ob.TrainConfig(epochs=2, batch_size=4)
-    first = ob.make("gru", TRAIN, **SMALL)
+    first = ob.make_model("gru", TRAIN, **SMALL)
     ob.fit(first, TRAIN, config=config, out=tmp_path, progress=False)
     log = (tmp_path / "log.csv").read_bytes()
-    again = ob.make("gru", TRAIN, **SMALL)
+    again = ob.make_model("gru", TRAIN, **SMALL)
     ob.fit(again, TRAIN, config=config, out=tmp_path, progress=False)
     assert same(weights(first), weights(again))
     assert (tmp_path / "log.csv").read_bytes() == log
 
 
 def test_a_run_can_be_trained_for_longer_and_ends_as_one_that_was_planned_so(tmp_path):
-    planned = ob.make("gru", TRAIN, **SMALL)
+    planned = ob.make_model("gru", TRAIN, **SMALL)
     ob.fit(planned, TRAIN, config=ob.TrainConfig(epochs=3, batch_size=4), progress=False)
     for epochs in (2, 3):
-        longer = ob.make("gru", TRAIN, **SMALL)
+        longer = ob.make_model("gru", TRAIN, **SMALL)
         config = ob.TrainConfig(epochs=epochs, batch_size=4)
         ob.fit(longer, TRAIN, config=config, out=tmp_path, progress=False)
     assert same(weights(planned), weights(longer))
     with pytest.raises(ob.InputError, match="3 epochs already, 2 were asked for"):
         ob.fit(
-            ob.make("gru", TRAIN, **SMALL), TRAIN,
+            ob.make_model("gru", TRAIN, **SMALL), TRAIN,
             config=ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path, progress=False,
         )  # fmt: skip
 
 
 def test_another_run_in_the_same_folder_is_refused_and_nothing_is_lost(tmp_path):
     config = ob.TrainConfig(epochs=1, batch_size=4)
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     ob.fit(model, TRAIN, config=config, out=tmp_path, progress=False)
-    before = weights(ob.load_checkpoint(tmp_path))
+    before = weights(ob.load_model(tmp_path))
     other = ob.TrainConfig(epochs=1, batch_size=4, learning_rate=0.5)
     with pytest.raises(ob.InputError, match=r"learning_rate \(0.001 then, 0.5 now\)"):
-        ob.fit(ob.make("gru", TRAIN, **SMALL), TRAIN, config=other, out=tmp_path, progress=False)
-    again = ob.make("gru", TRAIN, seed=1, **SMALL)
+        ob.fit(
+            ob.make_model("gru", TRAIN, **SMALL), TRAIN, config=other, out=tmp_path, progress=False
+        )
+    again = ob.make_model("gru", TRAIN, seed=1, **SMALL)
     with pytest.raises(ob.InputError, match="initial_weights"):
         ob.fit(again, TRAIN, config=config, out=tmp_path, progress=False)
     with pytest.raises(ob.InputError, match="trajectories"):
         ob.fit(
-            ob.make("gru", TRAIN, **SMALL), swinging(9), config=config, out=tmp_path, progress=False
+            ob.make_model("gru", TRAIN, **SMALL),
+            swinging(9),
+            config=config,
+            out=tmp_path,
+            progress=False,
         )
-    assert same(weights(ob.load_checkpoint(tmp_path)), before)
+    assert same(weights(ob.load_model(tmp_path)), before)
 
 
 def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkpoint(
@@ -244,20 +252,20 @@ def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkp
         return loss
 
     monkeypatch.setattr(training, "train_step", poisoned)
-    model = ob.make("gru", TRAIN, **SMALL)
+    model = ob.make_model("gru", TRAIN, **SMALL)
     config = ob.TrainConfig(epochs=5, batch_size=4)
     with pytest.raises(ob.DivergenceError, match=r"nan in epoch 3, step 2.*last good checkpoint"):
         ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     kept = sorted((tmp_path / "checkpoints").iterdir())
     assert [folder.name for folder in kept] == ["steps-000000006"]
     monkeypatch.setattr(training, "train_step", step)
-    again = ob.make("gru", TRAIN, **SMALL)
+    again = ob.make_model("gru", TRAIN, **SMALL)
     ob.fit(again, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     assert all(bool(torch.isfinite(p).all()) for p in again.parameters())
 
 
 def test_a_learning_rate_that_explodes_is_reported_as_a_divergence():
-    model = ob.make("ode_rnn", TRAIN, **SMALL)
+    model = ob.make_model("ode_rnn", TRAIN, **SMALL)
     config = ob.TrainConfig(epochs=30, optimizer="sgd", learning_rate=1e30, batch_size=4)
     with pytest.raises(ob.DivergenceError, match="lower the learning rate"):
         ob.fit(model, TRAIN, config=config, progress=False)
@@ -265,10 +273,10 @@ def test_a_learning_rate_that_explodes_is_reported_as_a_divergence():
 
 @pytest.mark.parametrize("name", ["gru", "anchored_ode_gru_d"])
 def test_a_checkpoint_gives_the_same_predictions_bit_for_bit(tmp_path, name):
-    model = ob.make(name, TRAIN, **SMALL)
+    model = ob.make_model(name, TRAIN, **SMALL)
     ob.fit(model, TRAIN, config=ob.TrainConfig(epochs=1), progress=False)
-    ob.save_checkpoint(model, tmp_path / "saved")
-    loaded = ob.load_checkpoint(tmp_path / "saved")
+    ob.save_model(model, tmp_path / "saved")
+    loaded = ob.load_model(tmp_path / "saved")
     expected, got = ob.predict(model, VALIDATION), ob.predict(loaded, VALIDATION)
     assert all(np.array_equal(a.values, b.values) for a, b in zip(expected, got, strict=True))
     assert loaded.config == model.config
@@ -278,24 +286,24 @@ def test_a_checkpoint_gives_the_same_predictions_bit_for_bit(tmp_path, name):
 @pytest.mark.parametrize("file", ["model.safetensors", "config.json"])
 def test_a_checkpoint_with_one_flipped_byte_is_refused(tmp_path, file):
     folder = tmp_path / "saved"
-    ob.save_checkpoint(ob.make("gru", TRAIN, **SMALL), folder)
+    ob.save_model(ob.make_model("gru", TRAIN, **SMALL), folder)
     whole = (folder / file).read_bytes()
     for position in np.linspace(0, len(whole) - 2, 40).astype(int):
         damaged = bytearray(whole)
         damaged[position] ^= 1
         (folder / file).write_bytes(bytes(damaged))
         with pytest.raises(ob.FileFormatError, match=r"damaged|not an Offbeat|version"):
-            ob.load_checkpoint(folder)
+            ob.load_model(folder)
     (folder / file).write_bytes(whole)
-    ob.load_checkpoint(folder)
+    ob.load_model(folder)
 
 
 def test_a_folder_that_is_no_checkpoint_or_a_newer_one_is_refused(tmp_path):
     with pytest.raises(ob.FileFormatError, match="not a checkpoint"):
-        ob.load_checkpoint(tmp_path / "nothing")
+        ob.load_model(tmp_path / "nothing")
     folder = tmp_path / "saved"
-    ob.save_checkpoint(ob.make("gru", TRAIN, **SMALL), folder)
+    ob.save_model(ob.make_model("gru", TRAIN, **SMALL), folder)
     facts = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**facts, "version": 2}))
     with pytest.raises(ob.FileFormatError, match="checkpoint version 2"):
-        ob.load_checkpoint(folder)
+        ob.load_model(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from offbeat.config import ModelConfig, PartsConfig, TrainConfig
+from offbeat.config import ModelConfig, SplitConfig, TrainConfig
 from offbeat.errors import (
     DivergenceError,
     FileFormatError,
@@ -15,84 +15,81 @@ from offbeat.errors import (
 )
 
 if TYPE_CHECKING:
+    from offbeat.answers.forecast import forecast
+    from offbeat.answers.impute import fit_two_sided, impute, load_two_sided, save_two_sided
+    from offbeat.answers.predict import predict
+    from offbeat.answers.scoring import score_forecast, score_imputation
+    from offbeat.answers.two_sided import TwoSided
+    from offbeat.comparison import Comparison, compare, read_runs
     from offbeat.data.batch import Batch, delta, last_values
-    from offbeat.data.prepare import Scaler, parts, split, split_in_time, windows
+    from offbeat.data.masking import mask_out
     from offbeat.data.readers import read
     from offbeat.data.simulate import simulate
+    from offbeat.data.splits import Scaler, apply_split, split, split_in_time, windows
     from offbeat.data.store import load, save
-    from offbeat.data.thin import thin
     from offbeat.data.trajectory import Dataset, Trajectory
     from offbeat.evaluation import Evaluation, evaluate
-    from offbeat.inference.export import export_onnx
-    from offbeat.inference.extrapolate import extrapolate
-    from offbeat.inference.impute import fit_two_sided, impute, load_two_sided, save_two_sided
-    from offbeat.inference.onnx_runner import OnnxStream
-    from offbeat.inference.policies import StreamPolicies
-    from offbeat.inference.predict import predict
-    from offbeat.inference.scoring import score_extrapolation, score_imputation
-    from offbeat.inference.stream import Stream
-    from offbeat.inference.two_sided import TwoSided
-    from offbeat.models.checkpoint import load_checkpoint, save_checkpoint
-    from offbeat.models.recurrence import RecurrentModel
-    from offbeat.models.zoo import THESIS_MODELS, make, thesis_config, train_config
-    from offbeat.report.comparison import Comparison, compare, read_runs
-    from offbeat.report.reproduction import write_report
-    from offbeat.scores import Score, Scores, row_0_constant
+    from offbeat.export.exporter import export_onnx
+    from offbeat.export.runner import OnnxStream
+    from offbeat.metrics import Score, Scores, row_0_constant
+    from offbeat.models.checkpoint import load_model, save_model
+    from offbeat.models.model import Model
+    from offbeat.models.zoo import THESIS_MODELS, make_model, thesis_config, train_config
+    from offbeat.stream.options import StreamOptions
+    from offbeat.stream.stream import Stream
     from offbeat.training import FitResult, fit
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 _HOMES = {
     "Batch": "data.batch",
-    "Comparison": "report.comparison",
+    "Comparison": "comparison",
     "Dataset": "data.trajectory",
     "Evaluation": "evaluation",
     "FitResult": "training",
-    "OnnxStream": "inference.onnx_runner",
-    "RecurrentModel": "models.recurrence",
-    "Scaler": "data.prepare",
-    "Score": "scores",
-    "Scores": "scores",
-    "Stream": "inference.stream",
-    "StreamPolicies": "inference.policies",
+    "Model": "models.model",
+    "OnnxStream": "export.runner",
+    "Scaler": "data.splits",
+    "Score": "metrics",
+    "Scores": "metrics",
+    "Stream": "stream.stream",
+    "StreamOptions": "stream.options",
     "THESIS_MODELS": "models.zoo",
     "Trajectory": "data.trajectory",
-    "TwoSided": "inference.two_sided",
-    "compare": "report.comparison",
+    "TwoSided": "answers.two_sided",
+    "apply_split": "data.splits",
+    "compare": "comparison",
     "delta": "data.batch",
     "evaluate": "evaluation",
-    "export_onnx": "inference.export",
-    "extrapolate": "inference.extrapolate",
+    "export_onnx": "export.exporter",
     "fit": "training",
-    "fit_two_sided": "inference.impute",
-    "impute": "inference.impute",
+    "fit_two_sided": "answers.impute",
+    "forecast": "answers.forecast",
+    "impute": "answers.impute",
     "last_values": "data.batch",
     "load": "data.store",
-    "load_checkpoint": "models.checkpoint",
-    "load_two_sided": "inference.impute",
-    "make": "models.zoo",
-    "parts": "data.prepare",
-    "predict": "inference.predict",
+    "load_model": "models.checkpoint",
+    "load_two_sided": "answers.impute",
+    "make_model": "models.zoo",
+    "mask_out": "data.masking",
+    "predict": "answers.predict",
     "read": "data.readers",
-    "read_runs": "report.comparison",
-    "row_0_constant": "scores",
+    "read_runs": "comparison",
+    "row_0_constant": "metrics",
     "save": "data.store",
-    "save_checkpoint": "models.checkpoint",
-    "save_two_sided": "inference.impute",
-    "score_extrapolation": "inference.scoring",
-    "score_imputation": "inference.scoring",
+    "save_model": "models.checkpoint",
+    "save_two_sided": "answers.impute",
+    "score_forecast": "answers.scoring",
+    "score_imputation": "answers.scoring",
     "simulate": "data.simulate",
-    "split": "data.prepare",
-    "split_in_time": "data.prepare",
+    "split": "data.splits",
+    "split_in_time": "data.splits",
     "thesis_config": "models.zoo",
-    "thin": "data.thin",
     "train_config": "models.zoo",
-    "windows": "data.prepare",
-    "write_report": "report.reproduction",
+    "windows": "data.splits",
 }
 
 __all__ = [
-    "THESIS_MODELS",
     "Batch",
     "Comparison",
     "Dataset",
@@ -102,50 +99,50 @@ __all__ = [
     "FitResult",
     "InputError",
     "MissingExtraError",
+    "Model",
     "ModelConfig",
     "OffbeatError",
     "OnnxStream",
-    "PartsConfig",
-    "RecurrentModel",
     "Scaler",
     "Score",
     "Scores",
+    "SplitConfig",
     "Stream",
-    "StreamPolicies",
+    "StreamOptions",
+    "THESIS_MODELS",
     "TrainConfig",
     "Trajectory",
     "TwoSided",
+    "apply_split",
     "compare",
     "delta",
     "evaluate",
     "export_onnx",
-    "extrapolate",
     "fit",
     "fit_two_sided",
+    "forecast",
     "impute",
     "last_values",
     "load",
-    "load_checkpoint",
+    "load_model",
     "load_two_sided",
-    "make",
-    "parts",
+    "make_model",
+    "mask_out",
     "predict",
     "read",
     "read_runs",
     "row_0_constant",
     "save",
-    "save_checkpoint",
+    "save_model",
     "save_two_sided",
-    "score_extrapolation",
+    "score_forecast",
     "score_imputation",
     "simulate",
     "split",
     "split_in_time",
     "thesis_config",
-    "thin",
     "train_config",
     "windows",
-    "write_report",
 ]
 
 

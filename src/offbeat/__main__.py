@@ -2,7 +2,7 @@
 
 import sys
 
-from offbeat.cli import main
+from offbeat.cli.app import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -43,10 +43,10 @@ class ModelConfig:
         input_decay: gamma_x, last values that fade to the training mean (equation 27).
         anchored: the state holds the channels themselves, and an observation sets them.
         update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
-        age_input: what tells a plain cell how old its knowledge is: `elapsed` since the last
+        time_input: what tells a plain cell how old its knowledge is: `elapsed` since the last
             observed row, `delta` per channel (equation 25), `gap` since the row before, or `none`.
-        age_unit: of that age: the median `gap` of training, or the `longest` age met there, so
-            that it is at most 1 in training. Ages that count many gaps are large beside the values,
+        time_input_unit: of that age: the median `gap` of training, or the `longest` age met there, so
+            that it is at most 1 in training. ElapsedTimes that count many gaps are large beside the values,
             and can take longer to learn from.
         self_feeding: share of rows at which the cell's input is the model's own decoded
             prediction in place of the observed values (one coin per row for the whole batch,
@@ -82,8 +82,8 @@ class ModelConfig:
     input_decay: bool | None = None
     anchored: bool | None = None
     update_rows: Literal["observed", "every"] | None = None
-    age_input: Literal["none", "elapsed", "delta", "gap"] | None = None
-    age_unit: Literal["gap", "longest"] | None = None
+    time_input: Literal["none", "elapsed", "delta", "gap"] | None = None
+    time_input_unit: Literal["gap", "longest"] | None = None
     self_feeding: float | None = None
     readout: Literal["target", "last_row"] | None = None
     init: Literal["normal", "fan_in"] | None = None
@@ -132,8 +132,8 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "decay": ("none", "trainable", "vector", "scalar"),
     "decay_rows": ("continuous", "every_row", "observed_rows"),
     "update_rows": ("observed", "every"),
-    "age_input": ("none", "elapsed", "delta", "gap"),
-    "age_unit": ("gap", "longest"),
+    "time_input": ("none", "elapsed", "delta", "gap"),
+    "time_input_unit": ("gap", "longest"),
     "readout": ("target", "last_row"),
     "init": ("normal", "fan_in"),
     "clock": ("first_observation", "first_row"),
@@ -151,7 +151,7 @@ SPLITS = ("by_trajectory", "in_time")
 
 
 @dataclass(frozen=True)
-class PartsConfig:
+class SplitConfig:
     """How recorded trajectories become a training, a validation and a test part.
 
     Attributes:
@@ -212,7 +212,7 @@ class PartsConfig:
 
     @property
     def hiding(self) -> dict[str, Any]:
-        """What `thin` is given beside the data and the seed."""
+        """What `mask_out` is given beside the data and the seed."""
         return {
             "observed_fraction": self.observed_fraction,
             "hide": self.hide,
@@ -235,7 +235,7 @@ class TrainConfig:
         clip_norm: gradients are scaled down to this global norm; None leaves them.
         loss_scale: the mean squared error is multiplied by this. Adam-like optimizers do not
             notice; `clip_norm` does.
-        seed: of the order of the batches (and the coins of self-feeding).
+        seed: of the order of the batches (and the generator of self-feeding).
         patience: stop when the validation MSE has not improved for so many epochs; None never
             stops early.
         keep: weights that `fit` leaves in the model: of the `last` epoch, or of the `best`

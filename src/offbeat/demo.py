@@ -13,24 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.data.prepare import Scaler, split, windows
+from offbeat.answers.predict import predict
+from offbeat.data.masking import mask_out
 from offbeat.data.simulate import available_cores, simulate
+from offbeat.data.splits import Scaler, split, windows
 from offbeat.data.store import save
-from offbeat.data.thin import thin
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError, MissingExtraError
 from offbeat.evaluation import LAST_VALUE, Evaluation, evaluate
-from offbeat.experiment.side_by_side import Job, one_thread, train_side_by_side
 from offbeat.files import write_json, write_text
-from offbeat.inference.predict import predict
-from offbeat.models.checkpoint import load_checkpoint
-from offbeat.models.recurrence import RecurrentModel
+from offbeat.metrics import SCORINGS
+from offbeat.models.checkpoint import load_model
+from offbeat.models.model import Model
 from offbeat.models.zoo import THESIS_MODELS, train_config
-from offbeat.report import figures
-from offbeat.report.animation import side_by_side
-from offbeat.report.style import style_of
-from offbeat.run_state import EpochRecord
-from offbeat.scores import SCORINGS
+from offbeat.plots import figures
+from offbeat.plots.animation import side_by_side
+from offbeat.plots.style import style_of
+from offbeat.run import EpochRecord
+from offbeat.sweeps.side_by_side import Job, one_thread, train_side_by_side
 
 ROBOT = "hopper"
 OBSERVED_FRACTION = 0.3
@@ -194,8 +194,8 @@ def run_demo(
     _check_folder(out, settings)
     recorded = simulate(ROBOT, n_trajectories, 2 * ROWS, seed=PROTOCOL_SEED, progress=progress)
     scaler = Scaler.fit("divide_by_max", recorded)
-    thinned = thin(windows(recorded, ROWS, seed=seed), OBSERVED_FRACTION, seed=seed)
-    parts = dict(zip(_PARTS, split(thinned, seed=seed), strict=True))
+    masked = mask_out(windows(recorded, ROWS, seed=seed), OBSERVED_FRACTION, seed=seed)
+    parts = dict(zip(_PARTS, split(masked, seed=seed), strict=True))
     write_json(out / "settings.json", settings)
     for name, part in parts.items():
         save(part, out / "data" / f"{name}.parquet")
@@ -214,7 +214,7 @@ def run_demo(
     train_side_by_side(list(jobs.values()), workers=workers, progress=progress)
     trainings = {name: Training(jobs[name].history(), full) for name, full in FULL_STEPS.items()}
     with one_thread():
-        models = {name: load_checkpoint(jobs[name].folder) for name in FULL_STEPS}
+        models = {name: load_model(jobs[name].folder) for name in FULL_STEPS}
         evaluation = evaluate(models, parts["test"], seed=seed)
         _write_scores(out, evaluation, trainings)
         # Chosen by its clock, not by its errors: the window that begins soonest after the release.
@@ -289,21 +289,21 @@ def _write_scores(out: Path, evaluation: Evaluation, trainings: Mapping[str, Tra
 
 def _draw_curves(
     out: Path,
-    models: Mapping[str, RecurrentModel],
+    models: Mapping[str, Model],
     validation: Dataset,
     trainings: Mapping[str, Training],
 ) -> None:
     trivial = evaluate(models[THESIS_MODELS[0]], validation).scores[LAST_VALUE]
     figure = figures.learning_curves(
         {name: training.history for name, training in trainings.items()},
-        last_value_rmse=trivial.honest.rmse,
+        last_value_rmse=trivial.after_first_observation.rmse,
         x="steps",
         units="divide_by_max units",
     )
     figures.save(figure, out / "learning_curves.png")
 
 
-def _draw_predictions(out: Path, models: Mapping[str, RecurrentModel], shown: Trajectory) -> None:
+def _draw_predictions(out: Path, models: Mapping[str, Model], shown: Trajectory) -> None:
     asked = Dataset((shown,))
     figure = figures.predictions(
         shown,
@@ -314,7 +314,7 @@ def _draw_predictions(out: Path, models: Mapping[str, RecurrentModel], shown: Tr
     figures.save(figure, out / "predictions.png")
 
 
-def _animate(out: Path, model: RecurrentModel, shown: Trajectory) -> tuple[str, ...]:
+def _animate(out: Path, model: Model, shown: Trajectory) -> tuple[str, ...]:
     """Two GIFs of one trajectory; or, where MuJoCo cannot render, a line that says why not."""
     free = ROWS // 2
     unseen = shown.observed & (np.arange(shown.rows) < free)[:, None]

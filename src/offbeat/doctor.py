@@ -9,6 +9,7 @@ import sys
 from typing import Any
 
 from offbeat import __version__
+from offbeat.kernels import cpu
 
 CORE = ("torch", "numpy", "pyarrow", "safetensors", "jsonargparse", "matplotlib", "pillow")
 EXTRAS = {
@@ -27,8 +28,6 @@ def examine() -> dict[str, Any]:
     """Versions, threads, scan bodies and extras, as a flat record."""
     import torch
 
-    from offbeat.kernels import fused
-
     found: dict[str, Any] = {
         "offbeat": __version__,
         "python": f"{platform.python_version()} ({sys.executable})",
@@ -38,8 +37,8 @@ def examine() -> dict[str, Any]:
         else os.cpu_count(),
         "torch threads": torch.get_num_threads(),
         "torch CUDA": torch.cuda.is_available(),
-        "scan body": _scan_body(),
-        "compiled bodies": ", ".join(fused.bodies()) or f"none: {fused.why_not}",
+        "scan backend": _scan_backend(),
+        "instruction sets": ", ".join(cpu.instruction_sets()) or f"none: {cpu.why_not}",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
     }
     for name in CORE:
@@ -50,12 +49,12 @@ def examine() -> dict[str, Any]:
     return found
 
 
-def _scan_body() -> str:
+def _scan_backend() -> str:
     from offbeat.errors import InputError
-    from offbeat.kernels import body
+    from offbeat.kernels import backend
 
     try:
-        name, why = body()
+        name, why = backend()
     except InputError as error:
         return f"none: {error}"
     return f"{name} ({why})"

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from offbeat.answers.scoring import ChannelScores
 from offbeat.data.batch import last_index
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.inference.scoring import ChannelScores
-from offbeat.models.recurrence import RecurrentModel
-from offbeat.scores import Scores, ScoreSums, last_value_predictions, table
+from offbeat.metrics import Scores, ScoreSums, last_value_predictions, table
+from offbeat.models.model import Model
 from offbeat.training import validate
 
 LAST_VALUE = "last_value"
@@ -41,24 +41,24 @@ class Evaluation:
     channel_cells: tuple[int, ...]
 
     def table(self, *, notes: Mapping[str, str] | None = None) -> str:
-        """A plain-text table of RMSE in scaled units, best honest score first."""
+        """A plain-text table of RMSE in scaled units, best first."""
         return table(self.scores, notes=notes)
 
     def channel_rmse(self, predictor: str) -> dict[str, float]:
-        """Honest RMSE of each channel, in the channel's own unit."""
-        mse = self.scores[predictor].honest.per_channel
+        """RMSE after the first observation of each channel, in the channel's own unit."""
+        mse = self.scores[predictor].after_first_observation.per_channel
         scales = zip(self.names, mse, self.channel_scale, strict=True)
         return {name: value**0.5 * abs(scale) for name, value, scale in scales}
 
     def in_units(self) -> ChannelScores:
-        """The honest RMSE of every predictor, per channel in its unit, and who is best."""
+        """The RMSE of every predictor after the first observation, per channel in its unit, and who is best."""
         return ChannelScores(
             "one step ahead",
             self.names,
             self.units,
             self.channel_cells,
             {name: tuple(self.channel_rmse(name).values()) for name in self.scores},
-            {name: scores.honest.rmse for name, scores in self.scores.items()},
+            {name: scores.after_first_observation.rmse for name, scores in self.scores.items()},
             (LAST_VALUE,),
         )
 
@@ -71,7 +71,7 @@ class Evaluation:
             "predictors": {
                 name: {
                     **scores.to_dict(),
-                    "honest_rmse_in_units": {
+                    "rmse_in_units": {
                         k: None if v != v else v for k, v in self.channel_rmse(name).items()
                     },
                 }
@@ -80,20 +80,18 @@ class Evaluation:
         }
 
 
-def evaluate(
-    models: RecurrentModel | Mapping[str, RecurrentModel], dataset: Dataset, *, seed: int = 0
-) -> Evaluation:
+def evaluate(models: Model | Mapping[str, Model], dataset: Dataset, *, seed: int = 0) -> Evaluation:
     """Scores one-step-ahead predictions of one or more models, and of the last observed value.
 
     Args:
         models: one model, or several by name; several must share scaler and training means.
-        dataset: thinned or not; hidden cells that are known are scored.
-        seed: of the coins of self-feeding.
+        dataset: masked or not; hidden cells that are known are scored.
+        seed: of the generator of self-feeding.
 
     Raises:
         InputError: the data has other channels than a model, or models score in other units.
     """
-    if isinstance(models, RecurrentModel):
+    if isinstance(models, Model):
         models = {models.config.name: models}
     if not models or LAST_VALUE in models:
         raise InputError(f"give at least one model, none of them named {LAST_VALUE!r}")
@@ -109,7 +107,7 @@ def evaluate(
                 "training means differ; train both on the same data, or evaluate them apart"
             )
     batch = first.batch(dataset)
-    honest = batch.known & batch.valid[..., None] & (last_index(batch.mask) >= 0)
+    counted = batch.known & batch.valid[..., None] & (last_index(batch.mask) >= 0)
     trivial = ScoreSums(batch.channels, gap_unit=first.statistics.median_gap)
     trivial.add(last_value_predictions(batch, first.mean), batch)
     scores = {name: validate(model, batch, seed=seed) for name, model in models.items()}
@@ -120,5 +118,5 @@ def evaluate(
         first.scaler.kind,
         tuple(first.scaler.scale.tolist()),
         len(dataset),
-        tuple(honest.sum(dim=(0, 1)).tolist()),
+        tuple(counted.sum(dim=(0, 1)).tolist()),
     )

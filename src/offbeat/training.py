@@ -21,11 +21,12 @@ from offbeat.data.batch import Batch
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
 from offbeat.files import writable
-from offbeat.kernels import RowTable
-from offbeat.kernels.fused import own_threads
-from offbeat.models.checkpoint import save_checkpoint
-from offbeat.models.recurrence import RecurrentModel
-from offbeat.run_state import (
+from offbeat.kernels import StepTable
+from offbeat.kernels.cpu import own_threads
+from offbeat.metrics import Scores, ScoreSums
+from offbeat.models.checkpoint import save_model
+from offbeat.models.model import Model
+from offbeat.run import (
     EpochRecord,
     RunState,
     flat_parameters,
@@ -34,7 +35,6 @@ from offbeat.run_state import (
     save_run,
     write_log,
 )
-from offbeat.scores import Scores, ScoreSums
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class FitResult:
 
 
 def fit(
-    model: RecurrentModel,
+    model: Model,
     train: Dataset,
     validation: Dataset | None = None,
     config: TrainConfig | None = None,
@@ -69,7 +69,7 @@ def fit(
     """Trains a model in place on one-step-ahead prediction.
 
     The loss is the mean squared error over the known cells of all rows but the first, in scaled
-    units. Batches, their order and all coins follow from `config.seed` alone.
+    units. Batches, their order and all generator follow from `config.seed` alone.
 
     Args:
         model: trained in place.
@@ -92,15 +92,19 @@ def fit(
         raise InputError("patience and keep='best' need a validation part; got none")
     folder = writable(out, folder=True) if out is not None else None
     batch = model.batch(train)
-    held_out = HeldOut(model, model.batch(validation)) if validation is not None else None
+    validation_set = (
+        ValidationSet(model, model.batch(validation)) if validation is not None else None
+    )
     with flat_parameters(model) as parameters, threads_for(model):
-        return _fit(model, batch, held_out, config, RunState(parameters, config), folder, progress)
+        return _fit(
+            model, batch, validation_set, config, RunState(parameters, config), folder, progress
+        )
 
 
 def _fit(
-    model: RecurrentModel,
+    model: Model,
     batch: Batch,
-    held_out: HeldOut | None,
+    validation_set: ValidationSet | None,
     config: TrainConfig,
     state: RunState,
     folder: Path | None,
@@ -120,7 +124,7 @@ def _fit(
     with _progress_bar(state, config, len(batch), progress) as bar:
         while state.epoch < config.epochs and not stopped:
             _epoch(model, examples, state, config, bar, folder, identity)
-            _close_epoch(model, batch, held_out, state, config)
+            _close_epoch(model, batch, validation_set, state, config)
             record = state.history[-1]
             bar.set_postfix_str(_postfix(record))
             for name, value in asdict(record).items() if writer else ():
@@ -134,55 +138,55 @@ def _fit(
     if config.keep == "best" and state.best:
         model.load_state_dict(state.best)
     if folder is not None:
-        save_checkpoint(model, folder / "model")
+        save_model(model, folder / "model")
     return FitResult(tuple(state.history), stopped and state.epoch < config.epochs, folder)
 
 
-class HeldOut:
+class ValidationSet:
     """A part that is scored again and again, its facts made once.
 
     Args:
-        model: its scales and statistics make the facts of the rows.
+        model: its scales and statistics make the step inputs.
         batch: scaled by the model's scaler.
         size: trajectories at a time.
     """
 
-    def __init__(self, model: RecurrentModel, batch: Batch, *, size: int = 500) -> None:
+    def __init__(self, model: Model, batch: Batch, *, size: int = 500) -> None:
         self.channels = batch.channels
         with torch.no_grad():
             parts = (batch.take(slice(i, i + size)) for i in range(0, len(batch), size))
-            self.parts = [(model.facts(part)[0], part) for part in parts]
+            self.parts = [(model.step_inputs(part)[0], part) for part in parts]
 
-    def scores(
-        self, model: RecurrentModel, *, seed: int = 0, gap_unit: float | None = None
-    ) -> Scores:
+    def scores(self, model: Model, *, seed: int = 0, gap_unit: float | None = None) -> Scores:
         """Scores a model as it stands.
 
         Args:
             model: to score.
-            seed: of the coins of self-feeding.
+            seed: of the generator of self-feeding.
             gap_unit: s; groups the honest score by age, as `ScoreSums` does.
         """
         sums = ScoreSums(self.channels, gap_unit=gap_unit)
         with torch.inference_mode():
             for rows, part in self.parts:
-                # The same coins for each part, as if they were one batch.
-                coins = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
-                sums.add(model.run(rows, coins=coins)[0], part)
+                # The same generator for each part, as if they were one batch.
+                generator = (
+                    torch.Generator().manual_seed(seed) if model.config.self_feeding else None
+                )
+                sums.add(model.run(rows, generator=generator)[0], part)
         return sums.scores()
 
 
-def validate(model: RecurrentModel, batch: Batch, *, seed: int = 0, size: int = 500) -> Scores:
+def validate(model: Model, batch: Batch, *, seed: int = 0, size: int = 500) -> Scores:
     """Scores a model on a scaled batch, a part at a time.
 
     Args:
         model: to score.
         batch: scaled by the model's scaler.
-        seed: of the coins of self-feeding.
+        seed: of the generator of self-feeding.
         size: trajectories at a time.
     """
-    held_out = HeldOut(model, batch, size=size)
-    return held_out.scores(model, seed=seed, gap_unit=model.statistics.median_gap)
+    validation_set = ValidationSet(model, batch, size=size)
+    return validation_set.scores(model, seed=seed, gap_unit=model.statistics.median_gap)
 
 
 # --- one epoch ------------------------------------------------------------------------------------
@@ -192,14 +196,14 @@ class Examples:
     """A training part in memory, as a step takes it: nothing is made anew from epoch to epoch.
 
     Args:
-        model: its scales and statistics make the facts of the rows.
+        model: its scales and statistics make the step inputs.
         batch: scaled.
     """
 
-    def __init__(self, model: RecurrentModel, batch: Batch) -> None:
+    def __init__(self, model: Model, batch: Batch) -> None:
         with torch.no_grad():
-            rows, _ = model.facts(batch)
-        self.table = RowTable.of(rows)
+            rows, _ = model.step_inputs(batch)
+        self.table = StepTable.of(rows)
         # Flat, and without the first row: long runs of memory are quick to compare.
         self.targets = batch.values[:, 1:].flatten(1).contiguous()
         counted = (batch.known & batch.valid[..., None])[:, 1:].flatten(1)
@@ -208,16 +212,16 @@ class Examples:
     def __len__(self) -> int:
         return len(self.table)
 
-    def loss(self, model: RecurrentModel, index: Tensor, coins: torch.Generator | None) -> Tensor:
+    def loss(self, model: Model, index: Tensor, generator: torch.Generator | None) -> Tensor:
         """Mean squared error of the one-step-ahead prediction of some trajectories.
 
         Args:
             model: as it stands.
             index: (batch,) positions of the trajectories.
-            coins: generator of the coins of self-feeding.
+            generator: generator of the generator of self-feeding.
         """
         rows = self.table.take(index)
-        predictions = model.run(rows, coins=coins)[0].flatten(1)[:, model.channels :]
+        predictions = model.run(rows, generator=generator)[0].flatten(1)[:, model.channels :]
         cells = predictions.shape[1]
         targets = self.targets.index_select(0, index)[:, :cells]
         if self.counted is None and cells:
@@ -229,7 +233,7 @@ class Examples:
 
 
 def _epoch(
-    model: RecurrentModel,
+    model: Model,
     examples: Examples,
     state: RunState,
     config: TrainConfig,
@@ -261,18 +265,18 @@ def _epoch(
 
 
 @contextmanager
-def threads_for(model: RecurrentModel) -> Iterator[None]:
+def threads_for(model: Model) -> Iterator[None]:
     """Within a `with` block, the threads go to whatever does the work of training a model.
 
     Args:
-        model: one that the fused body runs leaves torch with one thread.
+        model: one that the compiled backend runs leaves torch with one thread.
     """
-    with own_threads() if model.runs_fused() else nullcontext():
+    with own_threads() if model.runs_compiled() else nullcontext():
         yield
 
 
 def train_step(
-    model: RecurrentModel,
+    model: Model,
     examples: Examples,
     index: Tensor,
     state: RunState,
@@ -293,11 +297,11 @@ def train_step(
     Raises:
         DivergenceError: the loss is not finite.
     """
-    coins = None
+    generator = None
     if model.config.self_feeding:
         seed = np.random.default_rng([config.seed, state.epoch, state.step]).integers(2**62)
-        coins = torch.Generator().manual_seed(int(seed))
-    loss = examples.loss(model, index, coins)
+        generator = torch.Generator().manual_seed(int(seed))
+    loss = examples.loss(model, index, generator)
     value = float(loss.detach())
     if not math.isfinite(value):
         raise DivergenceError(
@@ -317,17 +321,21 @@ def train_step(
 
 
 def _close_epoch(
-    model: RecurrentModel,
+    model: Model,
     batch: Batch,
-    held_out: HeldOut | None,
+    validation_set: ValidationSet | None,
     state: RunState,
     config: TrainConfig,
 ) -> None:
     _check_weights(model, state)
-    scores = held_out.scores(model, seed=config.seed) if held_out is not None else None
-    if scores is not None and not math.isfinite(scores.rows_1_99.mse) and scores.rows_1_99.cells:
+    scores = validation_set.scores(model, seed=config.seed) if validation_set is not None else None
+    if (
+        scores is not None
+        and not math.isfinite(scores.after_first_row.mse)
+        and scores.after_first_row.cells
+    ):
         raise DivergenceError(
-            f"the validation MSE turned to {scores.rows_1_99.mse} after epoch {state.epoch + 1}; "
+            f"the validation MSE turned to {scores.after_first_row.mse} after epoch {state.epoch + 1}; "
             "the last good checkpoint is kept: lower the learning rate, or clip gradients"
         )
     nan = math.nan
@@ -335,22 +343,22 @@ def _close_epoch(
         epoch=state.epoch + 1,
         steps=state.total_steps,
         train_mse=state.loss_sum / state.step,
-        validation_honest_mse=scores.honest.mse if scores else nan,
-        validation_rows_1_99_mse=scores.rows_1_99.mse if scores else nan,
+        validation_mse=scores.after_first_observation.mse if scores else nan,
+        validation_after_first_row_mse=scores.after_first_row.mse if scores else nan,
         validation_published_mse=scores.published.mse if scores else nan,
         learning_rate=float(state.optimizer.param_groups[0]["lr"]),
         seconds=state.seconds,
     )
     state.history.append(record)
-    if scores is not None and scores.honest.mse < state.best_mse:
-        state.best_mse, state.best_epoch = scores.honest.mse, record.epoch
+    if scores is not None and scores.after_first_observation.mse < state.best_mse:
+        state.best_mse, state.best_epoch = scores.after_first_observation.mse, record.epoch
         if config.keep == "best":
             state.best = {k: v.detach().clone() for k, v in model.state_dict().items()}
     state.epoch += 1
     state.step, state.loss_sum, state.seconds = 0, 0.0, 0.0
 
 
-def _check_weights(model: RecurrentModel, state: RunState) -> None:
+def _check_weights(model: Model, state: RunState) -> None:
     if not all(bool(torch.isfinite(p).all()) for p in model.parameters()):
         raise DivergenceError(
             f"a weight left the finite numbers in epoch {state.epoch + 1}, step {state.step}; the "
@@ -395,6 +403,6 @@ def _progress_bar(
 
 
 def _postfix(record: EpochRecord) -> str:
-    if math.isnan(record.validation_honest_mse):
+    if math.isnan(record.validation_mse):
         return f"train RMSE {record.train_mse**0.5:.4f}"
-    return f"validation RMSE {record.validation_honest_mse**0.5:.4f}"
+    return f"validation RMSE {record.validation_mse**0.5:.4f}"

@@ -82,7 +82,7 @@ def advise(
     words = [f"--reader.{name}={_text(value)}" for name, value in options.items()]
     parts, for_parts = _parts(inspection, useful, options.get("held") == "mask" and bool(held))
     reasons += for_parts
-    words += [f"--parts.{name}={chosen}" for name, chosen in parts.items()]
+    words += [f"--split.{name}={chosen}" for name, chosen in parts.items()]
     words.append("--model.name=anchored_ode_gru_d")
     return Advice(("offbeat", "train", data, out, *words), tuple(reasons))
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.mend import find_held
-from offbeat.data.policies import sentences
+from offbeat.data.cleaning.channels import find_held
+from offbeat.data.cleaning.options import sentences
 from offbeat.data.trajectory import Dataset
 
 
@@ -95,7 +95,7 @@ class Inspection:
         channels: one entry each.
         episodes: one entry each.
         found: what the policies found and did, a sentence each.
-        report: the same in full, see `Policies`; empty for data that were not read from a log.
+        report: the same in full, see `ReaderOptions`; empty for data that were not read from a log.
     """
 
     source: str

@@ -2,7 +2,7 @@
 
 A reader says what stands in a file, as it was logged: a `Recording` per file or episode, with a
 `Signal` per sensor, topic or table. Whatever is to be decided about faults of clocks and sensors
-is decided here, once for all formats, by `Policies`; `assemble` applies them, counts what each did,
+is decided here, once for all formats, by `ReaderOptions`; `assemble` applies them, counts what each did,
 and merges signals of different rates on the union of their stamps.
 """
 
@@ -13,21 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.data import faults, mend
-from offbeat.data.clock import NANOSECONDS_PER
-from offbeat.data.merging import Channels, Episode, cut
-from offbeat.data.policies import Account
-from offbeat.data.policies import Policies as Policies
+from offbeat.data.cleaning import anomalies
+from offbeat.data.cleaning import channels as repairs
+from offbeat.data.cleaning.clocks import NANOSECONDS_PER
+from offbeat.data.cleaning.merging import Channels, Episode, cut
+from offbeat.data.cleaning.options import CleaningLog
+from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
 from offbeat.data.signals import Recording as Recording
 from offbeat.data.signals import Signal as Signal
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError
 
-DEFAULT = Policies()
+DEFAULT = ReaderOptions()
 """The safe defaults."""
 
 
-def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> Dataset:
+def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT) -> Dataset:
     """Makes a data set of recordings: merges their signals and applies the policies.
 
     In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
@@ -59,7 +60,9 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
     actions = next((r.actions.channels for r in given if r.actions is not None), None)
     labelled = any(recording.label for recording in given)
     del given
-    account = Account(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
+    account = CleaningLog(
+        quaternions=[list(channels.names_of(four)) for four in channels.quaternions]
+    )
     episodes: list[Episode] = []
     for i, recording in enumerate(waiting):
         assert recording is not None
@@ -92,30 +95,32 @@ def assemble(recordings: Iterable[Recording], policies: Policies = DEFAULT) -> D
 
 
 def _mask_held(
-    episodes: list[Episode], channels: Channels, policies: Policies, account: Account
+    episodes: list[Episode], channels: Channels, policies: ReaderOptions, account: CleaningLog
 ) -> None:
     for c, name in enumerate(channels.names):
-        held = mend.find_held([episode.values[:, c] for episode in episodes])
+        held = repairs.find_held([episode.values[:, c] for episode in episodes])
         if held is None:
             continue
         account.held[name] = {"share": held.share, "rows_per_value": held.rows_per_value}
         if policies.held == "mask":
             for episode in episodes:
                 column = episode.own()[:, c]
-                repeats = ~mend.measured_anew(column, held.rows_per_value) & ~np.isnan(column)
+                repeats = ~repairs.measured_anew(column, held.rows_per_value) & ~np.isnan(column)
                 column[repeats] = np.nan
                 account.masked += int(repeats.sum())
 
 
-def _mend(episode: Episode, channels: Channels, policies: Policies, account: Account) -> None:
+def _mend(
+    episode: Episode, channels: Channels, policies: ReaderOptions, account: CleaningLog
+) -> None:
     if policies.unwrap:
         for c, period in channels.angles.items():
-            turns = mend.unwrap(episode.own()[:, c], period)
+            turns = repairs.unwrap(episode.own()[:, c], period)
             if turns:
                 account.turns[channels.names[c]] += turns
     for four in channels.quaternions:
         part = episode.own()[:, list(four)]
-        mended = mend.mend_quaternion(part)
+        mended = repairs.mend_quaternion(part)
         episode.values[:, list(four)] = part
         account.flipped += mended.flipped
         account.renormalised += mended.renormalised
@@ -131,7 +136,7 @@ def _resample(episode: Episode, rate_hz: float) -> None:
     row = np.minimum(row, rows - 1)
     starts = np.flatnonzero(np.diff(row, prepend=-1))
     values = np.full((rows, episode.values.shape[1]), np.nan, order="F")
-    values[row[starts]] = faults.merge_rows(episode.values, starts, "last")
+    values[row[starts]] = anomalies.merge_rows(episode.values, starts, "last")
     episode.stamps, episode.values, episode.owned = grid + episode.stamps[0], values, True
 
 

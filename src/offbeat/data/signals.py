@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.clock import NANOSECONDS_PER
+from offbeat.data.cleaning.clocks import NANOSECONDS_PER
 from offbeat.errors import InputError, one_of
 
 KINDS = ("", "angle", "quaternion")

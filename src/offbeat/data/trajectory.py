@@ -20,7 +20,7 @@ SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
 class Trajectory:
     """What was measured over time: rows of channel values at strictly increasing times.
 
-    *Known* and *observed* differ: a cell that `thin` hid is known to the score and unseen by the
+    *Known* and *observed* differ: a cell that `mask_out` hid is known to the score and unseen by the
     model. `values` is NaN where a cell is not known; `observed` says what a model may look at.
 
     Args:

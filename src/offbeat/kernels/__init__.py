@@ -1,8 +1,8 @@
 """The scan over rows: one signature, and the two bodies that run it.
 
-The reference body (PyTorch) defines what a scan does and runs everywhere; the fused body (C++) does
+The reference backend (PyTorch) defines what a scan does and runs everywhere; the compiled backend (C++) does
 the same, faster, on the CPU. `OFFBEAT_SCAN` in the environment, or `use`, names the one to take:
-`auto`, `reference`, `fused`, or a compiled body such as `avx2`.
+`auto`, `reference`, `fused`, or a compiled backend such as `avx2`.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from contextvars import ContextVar
 from torch import Tensor
 
 from offbeat.errors import InputError, one_of
-from offbeat.kernels import fused, reference
+from offbeat.kernels import cpu, reference
 from offbeat.kernels.spec import (
     LARGEST_EXPONENT,
     Layers,
-    RowTable,
-    ScanRows,
     ScanSpec,
     ScanWeights,
-    TableRows,
+    StepInputs,
+    StepTable,
+    TableSteps,
 )
 
 __all__ = [
     "LARGEST_EXPONENT",
     "Layers",
-    "RowTable",
-    "ScanRows",
     "ScanSpec",
     "ScanWeights",
-    "TableRows",
-    "body",
+    "StepInputs",
+    "StepTable",
+    "TableSteps",
+    "backend",
     "perceptron",
     "scan",
     "use",
@@ -43,11 +43,11 @@ __all__ = [
 _chosen: ContextVar[str | None] = ContextVar("offbeat_scan", default=None)
 
 
-def body() -> tuple[str, str]:
+def backend() -> tuple[str, str]:
     """The body that scans run in here, and why.
 
     Returns:
-        `reference`, or the name of a compiled body such as `avx2`; and the reason in words.
+        `reference`, or the name of a compiled backend such as `avx2`; and the reason in words.
 
     Raises:
         InputError: a body is asked for that can't run here.
@@ -55,46 +55,46 @@ def body() -> tuple[str, str]:
     chosen, where = _chosen.get(), "offbeat.kernels.use"
     if chosen is None:
         chosen, where = os.environ.get("OFFBEAT_SCAN", "auto"), "OFFBEAT_SCAN"
-    compiled = fused.bodies()
-    one_of("scan body", chosen, ("auto", "reference", "fused", "baseline", "avx2", "avx512"))
+    compiled = cpu.instruction_sets()
+    one_of("scan backend", chosen, ("auto", "reference", "fused", "baseline", "avx2", "avx512"))
     if chosen == "reference":
         return "reference", f"asked for by {where}"
     if chosen == "auto":
         if not compiled:
-            return "reference", f"the fused body was not built: {fused.why_not}"
+            return "reference", f"the compiled backend was not built: {cpu.why_not}"
         return compiled[0], "the best that this processor runs"
     if not compiled:
         raise InputError(
-            f"{where} asks for the scan body {chosen!r}, but the fused body was not built "
-            f"({fused.why_not}); install Offbeat where a C++ compiler is"
+            f"{where} asks for the scan backend {chosen!r}, but the compiled backend was not built "
+            f"({cpu.why_not}); install Offbeat where a C++ compiler is"
         )
     if chosen == "fused":
         return compiled[0], f"asked for by {where}"
     if chosen not in compiled:
         raise InputError(
-            f"{where} asks for the scan body {chosen!r}; this processor runs {', '.join(compiled)}"
+            f"{where} asks for the scan backend {chosen!r}; this processor runs {', '.join(compiled)}"
         )
     return chosen, f"asked for by {where}"
 
 
 @contextmanager
 def use(name: str) -> Iterator[str]:
-    """Runs scans in the named body within a `with` block; yields what `body` then says.
+    """Runs scans in the named body within a `with` block; yields what `backend` then says.
 
     Args:
-        name: `auto`, `reference`, `fused`, or a compiled body.
+        name: `auto`, `reference`, `fused`, or a compiled backend.
     """
     token = _chosen.set(name)
     try:
-        yield body()[0]
+        yield backend()[0]
     finally:
         _chosen.reset(token)
 
 
 def scan(
-    spec: ScanSpec, weights: ScanWeights, rows: ScanRows | TableRows, state: Tensor
+    spec: ScanSpec, weights: ScanWeights, rows: StepInputs | TableSteps, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Carries a batch of states over all rows, in the fused body where it can run the spec.
+    """Carries a batch of states over all rows, in the compiled backend where it can run the spec.
 
     Args:
         spec: the shape of the scan.
@@ -106,10 +106,10 @@ def scan(
         Two tensors (batch, rows, state_size): the state carried to each row, before anything is
         observed there, and the state after the row.
     """
-    name = body()[0]
-    if name == "reference" or fused.unsupported(spec, weights, rows, state):
+    name = backend()[0]
+    if name == "reference" or cpu.unsupported(spec, weights, rows, state):
         return reference.scan(spec, weights, rows.gathered(), state)
-    return fused.scan(spec, weights, rows, state, name)
+    return cpu.scan(spec, weights, rows, state, name)
 
 
 def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
@@ -120,7 +120,7 @@ def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
         x: (..., inputs).
         activation: `tanh` or `silu`.
     """
-    name = body()[0]
-    if name == "reference" or not fused.supports_perceptron(layers, x):
+    name = backend()[0]
+    if name == "reference" or not cpu.supports_perceptron(layers, x):
         return reference.perceptron(layers, x, activation)
-    return fused.perceptron(layers, x, activation, name)
+    return cpu.perceptron(layers, x, activation, name)

@@ -1,4 +1,4 @@
-"""The reference body of the scan, in PyTorch: the loop over rows, written once.
+"""The reference backend of the scan, in PyTorch: the loop over rows, written once.
 
 decay -> flow over the gap -> (predictions are read here) -> cell at an observation
 """
@@ -15,15 +15,15 @@ from torch.nn.functional import linear, silu
 from offbeat.kernels.spec import (
     LARGEST_EXPONENT,
     Layers,
-    ScanRows,
     ScanSpec,
     ScanWeights,
+    StepInputs,
 )
-from offbeat.solvers import Field, solve, tableau
+from offbeat.ode import Field, solve, tableau
 
 
 def scan(
-    spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor
+    spec: ScanSpec, weights: ScanWeights, rows: StepInputs, state: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Carries a batch of states over all rows; every combination, as `offbeat.kernels.scan`."""
     before: list[Tensor] = []
@@ -64,7 +64,7 @@ def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
 # --- what does not depend on the state: for all rows at once --------------------------------------
 
 
-def _gates(spec: ScanSpec, weights: ScanWeights, rows: ScanRows) -> Tensor | None:
+def _gates(spec: ScanSpec, weights: ScanWeights, rows: StepInputs) -> Tensor | None:
     """(batch, rows, gates) input projection of the cell."""
     if spec.cell == "none":
         return None
@@ -74,14 +74,14 @@ def _gates(spec: ScanSpec, weights: ScanWeights, rows: ScanRows) -> Tensor | Non
     return linear(_input(rows, shown, slice(None)), _given(weights.inputs), weights.bias)
 
 
-def _input(rows: ScanRows, shown: Tensor, at: slice | int) -> Tensor:
+def _input(rows: StepInputs, shown: Tensor, at: slice | int) -> Tensor:
     parts = [shown, rows.mask[:, at]]
     if rows.age is not None:
         parts.append(rows.age[:, at])
     return torch.cat(parts, dim=-1)
 
 
-def _faded(weights: ScanWeights, rows: ScanRows) -> Tensor:
+def _faded(weights: ScanWeights, rows: StepInputs) -> Tensor:
     """x-hat of equation 27: the observed value, or what is left of the last one."""
     if weights.input_decay is None:
         raise ValueError("input_decay needs ScanWeights.input_decay")
@@ -112,7 +112,7 @@ Decay = Tensor | DecayAlongGap | None
 """Of one row: the factor of h, or the exponents where they act step by step, or nothing."""
 
 
-def _decays(spec: ScanSpec, weights: ScanWeights, rows: ScanRows) -> Sequence[Decay]:
+def _decays(spec: ScanSpec, weights: ScanWeights, rows: StepInputs) -> Sequence[Decay]:
     """The decay of each row; where it acts at once, the factors of all rows in one go."""
     if not spec.decay:
         return [None] * rows.rows
@@ -144,7 +144,7 @@ def _given(tensor: Tensor | None) -> Tensor:
 
 
 def _fed_gate(
-    spec: ScanSpec, weights: ScanWeights, rows: ScanRows, state: Tensor, i: int
+    spec: ScanSpec, weights: ScanWeights, rows: StepInputs, state: Tensor, i: int
 ) -> Tensor:
     hidden = state[:, spec.anchors : spec.anchors + spec.hidden_size]
     decoded = perceptron(weights.decoder, hidden, "tanh")

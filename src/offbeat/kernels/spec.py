@@ -1,6 +1,6 @@
 """What a scan consists of: its shape, its weights, and one record of what is known of each row.
 
-A scan carries a state over rows. The facts of a row (`ScanRows`) follow from times, masks and
+A scan carries a state over rows. The facts of a row (`StepInputs`) follow from times, masks and
 values alone; no weight has touched them, so they are made once for a data set. Everything that a
 weight touches happens inside the scan: what does not depend on the state (input projection, decay
 exponents, x-hat), and what does (innovation, self-feeding, vector field, recurrent product).
@@ -160,7 +160,7 @@ QUANTITIES = (
 
 
 @dataclass(frozen=True, eq=False)
-class ScanRows:
+class StepInputs:
     """What is known of each row; no weight has touched it.
 
     Attributes:
@@ -204,8 +204,8 @@ class ScanRows:
         """Rows of the longest trajectory."""
         return self.gap.shape[1]
 
-    def gathered(self) -> ScanRows:
-        """These rows; `TableRows` has them in a table."""
+    def gathered(self) -> StepInputs:
+        """These rows; `TableSteps` has them in a table."""
         return self
 
     def known(self) -> Iterator[Tensor]:
@@ -216,14 +216,14 @@ class ScanRows:
 
 
 @dataclass(frozen=True, eq=False)
-class RowTable:
+class StepTable:
     """The facts of many trajectories side by side in one tensor, so that a batch is one gather.
 
     Attributes:
         table: (trajectories, rows, columns), the columns in one piece.
         places: of each fact: its name, its columns, and whether it has an axis of units.
-        mean: as `ScanRows.mean`.
-        length: as `ScanRows.length`.
+        mean: as `StepInputs.mean`.
+        length: as `StepInputs.length`.
     """
 
     table: Tensor
@@ -232,7 +232,7 @@ class RowTable:
     length: Tensor | None
 
     @classmethod
-    def of(cls, rows: ScanRows) -> RowTable:
+    def of(cls, rows: StepInputs) -> StepTable:
         """Puts facts side by side.
 
         Args:
@@ -260,7 +260,7 @@ class RowTable:
         where = {name: (at.start, at.stop - at.start) for name, at, _ in self.places}
         return tuple(where.get(name, (0, 0)) for name in QUANTITIES)
 
-    def take(self, index: Tensor) -> TableRows:
+    def take(self, index: Tensor) -> TableSteps:
         """Some trajectories, trimmed to the longest of them.
 
         Args:
@@ -268,22 +268,22 @@ class RowTable:
         """
         length = None if self.length is None else self.length.index_select(0, index)
         rows = self.table.shape[1] if length is None else int(length.max())
-        return TableRows(self, index, rows, length)
+        return TableSteps(self, index, rows, length)
 
 
 @dataclass(frozen=True, eq=False)
-class TableRows:
-    """Rows that lie in a table: the fused body reads them there, others have them gathered.
+class TableSteps:
+    """Rows that lie in a table: the compiled backend reads them there, others have them gathered.
 
     Attributes:
         table: has the rows.
         index: (batch,) positions of the trajectories in it, int64.
         rows: of the longest of them.
-        length: (batch,) as `ScanRows.length`.
-        fed: as `ScanRows.fed`.
+        length: (batch,) as `StepInputs.length`.
+        fed: as `StepInputs.fed`.
     """
 
-    table: RowTable
+    table: StepTable
     index: Tensor
     rows: int
     length: Tensor | None
@@ -292,14 +292,14 @@ class TableRows:
     def __len__(self) -> int:
         return len(self.index)
 
-    def gathered(self) -> ScanRows:
+    def gathered(self) -> StepInputs:
         """The rows, side by side."""
         table = self.table.table[:, : self.rows].index_select(0, self.index)
         facts: dict[str, Any] = {
             name: table[..., at] if units else table[..., at.start]
             for name, at, units in self.table.places
         }
-        return ScanRows(**facts, mean=self.table.mean, length=self.length, fed=self.fed)
+        return StepInputs(**facts, mean=self.table.mean, length=self.length, fed=self.fed)
 
     def known(self) -> Iterator[Tensor]:
         """All tensors of numbers that there are."""

@@ -14,10 +14,10 @@ from safetensors.torch import save as dump_tensors
 from torch import Tensor
 
 from offbeat.config import ModelConfig, from_mapping
-from offbeat.data.prepare import Scaler
+from offbeat.data.splits import Scaler
 from offbeat.errors import FileFormatError
 from offbeat.files import atomic_folder
-from offbeat.models.recurrence import RecurrentModel
+from offbeat.models.model import Model
 from offbeat.models.statistics import Statistics
 
 FORMAT = "offbeat-checkpoint"
@@ -26,7 +26,7 @@ TENSORS = "model.safetensors"
 CONFIG = "config.json"
 
 
-def save_checkpoint(model: RecurrentModel, path: str | Path) -> None:
+def save_model(model: Model, path: str | Path) -> None:
     """Writes a model to a folder, atomically; one that stood there is replaced.
 
     Args:
@@ -36,7 +36,7 @@ def save_checkpoint(model: RecurrentModel, path: str | Path) -> None:
     _write(path, _weights(model), _facts(model))
 
 
-def load_checkpoint(path: str | Path) -> RecurrentModel:
+def load_model(path: str | Path) -> Model:
     """Reads a model back: the same predictions, bit for bit.
 
     Args:
@@ -63,7 +63,7 @@ def load_checkpoint(path: str | Path) -> RecurrentModel:
 
 
 def save_training_state(
-    model: RecurrentModel, tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
+    model: Model, tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
 ) -> None:
     """Writes a model with all that its training needs to go on.
 
@@ -83,7 +83,7 @@ def load_training_state(
     """Reads what `save_training_state` wrote: weights, training tensors, facts.
 
     Raises:
-        FileFormatError: as `load_checkpoint`.
+        FileFormatError: as `load_model`.
     """
     tensors, facts = _read(Path(path))
     if "training" not in facts:
@@ -95,11 +95,11 @@ def load_training_state(
     return weights, training, facts["training"]
 
 
-def _weights(model: RecurrentModel) -> dict[str, Tensor]:
+def _weights(model: Model) -> dict[str, Tensor]:
     return {k: v.detach().cpu().clone() for k, v in model.state_dict().items()}
 
 
-def _facts(model: RecurrentModel) -> dict[str, Any]:
+def _facts(model: Model) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -114,8 +114,8 @@ def _facts(model: RecurrentModel) -> dict[str, Any]:
     }
 
 
-def _build(facts: dict[str, Any]) -> RecurrentModel:
-    return RecurrentModel(
+def _build(facts: dict[str, Any]) -> Model:
+    return Model(
         from_mapping(ModelConfig, facts["model"]),
         Statistics.from_dict(facts["statistics"]),
         scaler=Scaler.from_dict(facts["scaler"]),

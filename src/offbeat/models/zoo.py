@@ -7,10 +7,10 @@ from typing import Any
 
 from offbeat.config import ModelConfig, TrainConfig, from_mapping
 from offbeat.data.batch import Batch
-from offbeat.data.prepare import Scaler, ScalerKind, check_observed
+from offbeat.data.splits import Scaler, ScalerKind, check_observed
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
-from offbeat.models.recurrence import RecurrentModel
+from offbeat.models.model import Model
 from offbeat.models.statistics import Statistics
 
 _COMMON: dict[str, Any] = {
@@ -31,8 +31,8 @@ _COMMON: dict[str, Any] = {
     "input_decay": False,
     "anchored": False,
     "update_rows": "observed",
-    "age_input": "none",
-    "age_unit": "gap",
+    "time_input": "none",
+    "time_input_unit": "gap",
     "self_feeding": 0.0,
     "readout": "target",
     "init": "normal",
@@ -43,10 +43,10 @@ _COMMON: dict[str, Any] = {
 """Sizes and initial weights of the thesis (chapter 3, after Rubanova et al. 2019)."""
 
 ZOO: dict[str, dict[str, Any]] = {
-    "rnn": {"cell": "elman", "age_input": "elapsed"},
-    "lstm": {"cell": "lstm", "age_input": "elapsed"},
-    "gru": {"age_input": "elapsed"},
-    "rnn_decay": {"decay": "vector", "age_input": "elapsed"},
+    "rnn": {"cell": "elman", "time_input": "elapsed"},
+    "lstm": {"cell": "lstm", "time_input": "elapsed"},
+    "gru": {"time_input": "elapsed"},
+    "rnn_decay": {"decay": "vector", "time_input": "elapsed"},
     "gru_d": {"decay": "trainable", "input_decay": True},
     "neural_ode": {"cell": "none", "vector_field": "mlp"},
     "ode_rnn": {"vector_field": "mlp"},
@@ -102,7 +102,7 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
         "decay_rows": "observed_rows" if feeding else "every_row",
     }
     if name == "gru":
-        protocol["age_input"] = "gap"
+        protocol["time_input"] = "gap"
     return ModelConfig(name=name, **{**protocol, **options})
 
 
@@ -133,14 +133,14 @@ def train_config(name: str, **options: Any) -> TrainConfig:
     return config
 
 
-def make(
+def make_model(
     model: str | ModelConfig,
     train: Dataset,
     *,
     scaler: ScalerKind | Scaler = "standardise",
     seed: int = 0,
     **options: Any,
-) -> RecurrentModel:
+) -> Model:
     """Makes an untrained model for the channels, scales and gaps of a training set.
 
     Args:
@@ -154,7 +154,7 @@ def make(
         InputError: unknown model or option, or a channel that is never observed.
 
     Example:
-        >>> model = make("ode_rnn", train, hidden_size=32)  # doctest: +SKIP
+        >>> model = make_model("ode_rnn", train, hidden_size=32)  # doctest: +SKIP
     """
     config = ModelConfig(name=model) if isinstance(model, str) else model
     for key in options:
@@ -168,6 +168,4 @@ def make(
             f"the scaler has {len(scaler.shift)} channels, the data has {train.channels}"
         )
     statistics = Statistics.of(Batch.of(train, scaler=scaler))
-    return RecurrentModel(
-        config, statistics, scaler=scaler, names=train.names, units=train.units, seed=seed
-    )
+    return Model(config, statistics, scaler=scaler, names=train.names, units=train.units, seed=seed)

@@ -18,7 +18,7 @@ from typing import Any
 
 from offbeat.data import store
 from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, ulog
-from offbeat.data.recording import Policies, Recording, assemble
+from offbeat.data.recording import ReaderOptions, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
@@ -29,7 +29,7 @@ ENTRY_POINTS = "offbeat.readers"
 FOLDER = "/"
 """Stands among the suffixes of a reader that reads folders; it must have `recognises`."""
 
-POLICIES = tuple(field.name for field in fields(Policies))
+POLICIES = tuple(field.name for field in fields(ReaderOptions))
 """The options that every format has."""
 
 
@@ -96,7 +96,7 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
         path: the file or folder.
         format: name of the reader; by default found by the file's suffix and content.
         **options: options of the format, such as `time_unit` of CSV, and the fields of
-            `Policies`, which every format has but our own.
+            `ReaderOptions`, which every format has but our own.
 
     Returns:
         The data set. Its `meta["report"]` says what the policies did, `meta["source"]` where it
@@ -124,7 +124,7 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
                 f"apply, got {', '.join(policies)}"
             )
         return made
-    dataset = assemble(made, Policies(**policies))
+    dataset = assemble(made, ReaderOptions(**policies))
     for note in dataset.meta["report"]["notes"]:
         logging.getLogger("offbeat").warning("%s: %s", path, note)
     return replace(dataset, meta={"source": path.name, "format": reader.name, **dataset.meta})

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.clock import TIME_NAMES, split_unit, time_column_of, to_nanoseconds
+from offbeat.data.cleaning.clocks import TIME_NAMES, split_unit, time_column_of, to_nanoseconds
 from offbeat.data.recording import Recording, Signal
 from offbeat.errors import FileFormatError, one_of
 

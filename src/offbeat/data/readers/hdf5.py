@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.clock import state_time_unit, time_column_of, to_nanoseconds
+from offbeat.data.cleaning.clocks import state_time_unit, time_column_of, to_nanoseconds
 from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file

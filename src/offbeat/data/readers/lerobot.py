@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.clock import state_time_unit, to_nanoseconds
+from offbeat.data.cleaning.clocks import state_time_unit, to_nanoseconds
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.lerobot_info import Feature, Info, Rows, read_columns
 from offbeat.data.signals import Recording, Signal

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.data.clock import time_column_of
+from offbeat.data.cleaning.clocks import time_column_of
 from offbeat.data.readers.options import names
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of

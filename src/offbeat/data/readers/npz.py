@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.clock import state_time_unit, time_column_of
+from offbeat.data.cleaning.clocks import state_time_unit, time_column_of
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import LABEL_NAMES, Coder, Columns, Gathered, listed, recordings
 from offbeat.data.recording import Recording

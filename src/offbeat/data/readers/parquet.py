@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from offbeat.data.clock import state_time_unit, time_column_of
+from offbeat.data.cleaning.clocks import state_time_unit, time_column_of
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullCellError, gather_columns, line_error
 from offbeat.data.readers.columns import Columns, listed, recordings

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from offbeat.data.clock import NANOSECONDS_PER, state_time_unit
+from offbeat.data.cleaning.clocks import NANOSECONDS_PER, state_time_unit
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullCellError, gather, line_error
 from offbeat.data.readers.columns import Columns, Gathered, listed, recordings

@@ -1,0 +1,1 @@
+"""Answers in original units: predictions, filled gaps, forecasts, and their scores."""

@@ -1,0 +1,185 @@
+"""Filling what was not observed; and the pair of models that fills from both sides."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from offbeat.answers.fill_rule import FillRule
+from offbeat.answers.predict import predict
+from offbeat.answers.two_sided import (
+    TwoSided,
+    fill_two_sided,
+    fit_rule,
+    reversed_in_time,
+)
+from offbeat.config import TrainConfig
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.files import write_json
+from offbeat.models.checkpoint import load_model, save_model
+from offbeat.models.model import Model
+from offbeat.models.zoo import make_model
+from offbeat.training import FitResult, fit
+
+MODES = ("causal", "two_sided")
+"""Ways of filling: from the past alone, or from both sides."""
+
+RULE_FILE = "two_sided.json"
+"""Where a run keeps its rule; `backward` beside it is the run of the backward model."""
+
+
+def impute(
+    model: Model | TwoSided,
+    dataset: Dataset,
+    *,
+    mode: Literal["causal", "two_sided"] | None = None,
+    seed: int = 0,
+) -> Dataset:
+    """Fills every cell that is not observed: hidden ones, and those that were never measured.
+
+    `causal` gives a cell what the model predicts there from what was observed strictly before its
+    row. `two_sided` joins that with what a backward model says from the other side, by the rule in
+    `offbeat.answers.two_sided`. Neither looks at the cell itself, or at other hidden ones.
+
+    Args:
+        model: a trained model, or a pair from `fit_two_sided`.
+        dataset: what was observed.
+        mode: `causal` or `two_sided`; by default two-sided where the model is a pair.
+        seed: of the generator of self-feeding.
+
+    Returns:
+        The trajectories, channels in the order of the model, in original units. No cell is NaN;
+        `observed` says which were measured, and False there is a cell that was filled.
+
+    Raises:
+        InputError: other channels than the model's, or two-sided filling asked of a single model.
+    """
+    pair = model if isinstance(model, TwoSided) else None
+    mode = mode or ("two_sided" if pair else "causal")
+    one_of("mode", mode, MODES)
+    forward = model.forward if isinstance(model, TwoSided) else model
+    if mode == "two_sided" and pair is None:
+        raise InputError(
+            "filling from both sides needs a backward model, got a single one; train with "
+            "two_sided (offbeat train --two_sided true, or fit_two_sided), or fill 'causal'"
+        )
+    if dataset.names != forward.names and set(dataset.names) == set(forward.names):
+        dataset = dataset.select(forward.names)
+    if mode == "two_sided" and pair is not None:
+        fills = fill_two_sided(pair, dataset, seed=seed)
+    else:
+        fills = [t.values for t in predict(forward, dataset, seed=seed)]
+    filled = (
+        replace(
+            t,
+            values=np.where(t.observed, t.values, values),
+            names=forward.names,
+            units=forward.units,
+        )
+        for t, values in zip(dataset, fills, strict=True)
+    )
+    meta = {**dataset.meta, "filled_by": forward.config.name, "filled": mode}
+    return Dataset(tuple(filled), meta)
+
+
+def fit_two_sided(
+    model: Model,
+    train: Dataset,
+    validation: Dataset,
+    config: TrainConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    seed: int = 0,
+    progress: bool = True,
+) -> tuple[TwoSided, FitResult, FitResult]:
+    """Trains a model, its counterpart on reversed trajectories, and the rule that joins them.
+
+    Args:
+        model: trained in place, as by `fit`; the backward one is made with its config and scaler.
+        train: the training part.
+        validation: scored after each epoch; the rule is chosen on its hidden cells.
+        config: of both trainings; by default `TrainConfig()`.
+        out: folder of the run; the backward model's is `backward` inside it. A run that was stopped
+            goes on where it was.
+        seed: of the initial weights of the backward model.
+        progress: show progress bars.
+
+    Returns:
+        The pair, and the logs of the forward and the backward training.
+
+    Raises:
+        InputError: as `fit`.
+        DivergenceError: as `fit`.
+    """
+    folder = Path(out) if out is not None else None
+    ahead = fit(model, train, validation, config, out=folder, progress=progress)
+    back = make_model(model.config, reversed_in_time(train), scaler=model.scaler, seed=seed)
+    back.to(model.dtype)
+    backwards = fit(
+        back,
+        reversed_in_time(train),
+        reversed_in_time(validation),
+        config,
+        out=folder / "backward" if folder is not None else None,
+        progress=progress,
+    )
+    pair = TwoSided(model, back, fit_rule(model, back, validation, seed=seed))
+    if folder is not None:
+        write_json(folder / RULE_FILE, pair.rule.to_dict())
+    return pair, ahead, backwards
+
+
+def save_two_sided(pair: TwoSided, path: str | Path) -> None:
+    """Writes a pair to a folder: `model`, `backward/model` and the rule.
+
+    Args:
+        pair: to write.
+        path: the folder; `load_two_sided` and, for the forward model, `load_model` read it.
+    """
+    path = Path(path)
+    save_model(pair.forward, path / "model")
+    save_model(pair.backward, path / "backward" / "model")
+    write_json(path / RULE_FILE, pair.rule.to_dict())
+
+
+def load_two_sided(path: str | Path) -> TwoSided:
+    """Reads what `save_two_sided` or a two-sided training wrote.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        FileFormatError: a model or the rule is missing or damaged.
+    """
+    path = Path(path)
+    if not (path / RULE_FILE).is_file():
+        raise FileFormatError(
+            f"{path} has no {RULE_FILE}: it is no two-sided run; train with --two_sided true"
+        )
+    try:
+        rule = FillRule.from_dict(json.loads((path / RULE_FILE).read_text(encoding="utf-8")))
+        return TwoSided(load_model(path), load_model(path / "backward"), rule)
+    except FileFormatError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(
+            f"{path / RULE_FILE} is damaged ({error}); the same training writes it again"
+        ) from None
+
+
+def load_run(path: str | Path) -> Model | TwoSided:
+    """Reads the model of a folder, or the pair where the run is two-sided.
+
+    Args:
+        path: folder of a run or of a checkpoint.
+
+    Raises:
+        FileFormatError: as `load_model` and `load_two_sided`.
+    """
+    two_sided = (Path(path) / RULE_FILE).is_file()
+    return load_two_sided(path) if two_sided else load_model(path)

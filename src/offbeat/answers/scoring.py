@@ -1,0 +1,378 @@
+"""Fills and forecasts beside trivial predictors: all on the same cells, in original units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from offbeat.answers.forecast import checked_horizons
+from offbeat.answers.impute import impute
+from offbeat.answers.predict import predict
+from offbeat.answers.two_sided import TwoSided
+from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
+from offbeat.data.masking import masked_values
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.errors import InputError
+from offbeat.models.model import Model
+
+OVERALL = "all, scaled"
+"""Name of the last line of a table: all channels together, in units of their training spread."""
+
+
+@dataclass(frozen=True)
+class ChannelScores:
+    """RMSE of several predictors on the same cells, per channel in its unit.
+
+    Attributes:
+        task: what was predicted, as a heading says it.
+        names: of the channels.
+        units: of the channels.
+        cells: per channel, how many were scored.
+        rmse: per predictor, per channel; NaN where a channel has no cell.
+        overall: per predictor, over the cells of all channels, each in units of its scale.
+        trivial: which of the predictors are trivial.
+    """
+
+    task: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    cells: tuple[int, ...]
+    rmse: Mapping[str, tuple[float, ...]]
+    overall: Mapping[str, float]
+    trivial: tuple[str, ...]
+
+    def table(self) -> str:
+        """A plain-text table, a line per channel, a column per predictor."""
+        predictors = list(self.rmse)
+        lines = [["channel", "unit", "cells", *predictors]]
+        each = zip(self.names, self.units, self.cells, strict=True)
+        for i, (name, unit, count) in enumerate(each):
+            numbers = [_shown(self.rmse[p][i]) for p in predictors]
+            lines.append([name, unit or "-", str(count), *numbers])
+        overall = [_shown(self.overall[p]) for p in predictors]
+        lines.append([OVERALL, "-", str(sum(self.cells)), *overall])
+        return _aligned(lines)
+
+    def verdict(self) -> str:
+        """Which predictor is best, in words; where a trivial one wins, it says so."""
+        ranked = sorted((v, name) for name, v in self.overall.items() if v == v)
+        if not ranked:
+            return f"{self.task}: nothing to score"
+        best_trivial = next((v, name) for v, name in ranked if name in self.trivial)
+        models = [(v, name) for v, name in ranked if name not in self.trivial]
+        said = [f"{self.task}: "]
+        if not models or models[0][0] >= best_trivial[0]:
+            against = f", the model has {_shown(models[0][0])}" if models else ""
+            said.append(
+                f"the trivial predictor {best_trivial[1]} wins with RMSE "
+                f"{_shown(best_trivial[0])} (scaled){against}"
+            )
+        else:
+            said.append(
+                f"{models[0][1]} wins with RMSE {_shown(models[0][0])} (scaled), the best trivial "
+                f"predictor, {best_trivial[1]}, has {_shown(best_trivial[0])}"
+            )
+        lost = []
+        for i, name in enumerate(self.names):
+            value, who = min((self.rmse[p][i], p) for p in self.rmse)
+            if value == value and who in self.trivial:
+                lost.append(f"{name} ({who})")
+        if lost:
+            shown = ", ".join(lost[:8]) + (", ..." if len(lost) > 8 else "")
+            said.append(
+                f"; a trivial predictor wins in {len(lost)} of {len(self.names)} channels: {shown}"
+            )
+        return "".join(said)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form; null where there is no cell."""
+        return {
+            "task": self.task,
+            "cells": dict(zip(self.names, self.cells, strict=True)),
+            "units": dict(zip(self.names, self.units, strict=True)),
+            "rmse_in_units": {
+                predictor: dict(zip(self.names, map(_plain, values), strict=True))
+                for predictor, values in self.rmse.items()
+            },
+            "rmse_scaled": {name: _plain(value) for name, value in self.overall.items()},
+            "verdict": self.verdict(),
+        }
+
+
+class ErrorSums:
+    """Adds up squared errors of predictors, trajectory by trajectory, on cells they share.
+
+    Args:
+        names: of the channels.
+        units: of the channels.
+        scale: (channels,) of each channel, in its unit, for the error over all channels.
+    """
+
+    def __init__(self, names: Sequence[str], units: Sequence[str], scale: ArrayLike) -> None:
+        self.names, self.units = tuple(names), tuple(units)
+        self.scale = np.asarray(scale, dtype=np.float64)
+        self._cells = np.zeros(len(self.names), dtype=np.int64)
+        self._sums: dict[str, NDArray[np.float64]] = {}
+
+    def add(
+        self,
+        truth: NDArray[np.float64],
+        predictions: Mapping[str, NDArray[np.float64]],
+        counted: NDArray[np.bool_],
+    ) -> None:
+        """Adds rows.
+
+        Args:
+            truth: (rows, channels) known where counted.
+            predictions: per predictor (rows, channels); the same predictors in every call.
+            counted: (rows, channels) cells that are scored.
+        """
+        self._cells += counted.sum(axis=0)
+        for name, values in predictions.items():
+            squared = np.where(counted, values - truth, 0.0) ** 2
+            self._sums[name] = self._sums.get(name, 0.0) + squared.sum(axis=0)
+
+    def scores(self, task: str, trivial: Sequence[str]) -> ChannelScores:
+        """The scores of everything added so far."""
+        cells, total = self._cells, int(self._cells.sum())
+        each = {
+            name: tuple(
+                float((s / n) ** 0.5) if n else float("nan")
+                for s, n in zip(sums, cells, strict=True)
+            )
+            for name, sums in self._sums.items()
+        }
+        overall = {
+            name: float((sums / self.scale**2).sum() / total) ** 0.5 if total else float("nan")
+            for name, sums in self._sums.items()
+        }
+        return ChannelScores(
+            task, self.names, self.units, tuple(cells.tolist()), each, overall, tuple(trivial)
+        )
+
+
+@dataclass(frozen=True)
+class ImputationScores:
+    """Imputation scores of all hidden cells, and by the length of the gap they lie in.
+
+    Attributes:
+        scores: of all hidden cells.
+        inside: s, upper end of each group of gaps, and the scores of the hidden cells that have an
+            observation of their channel on both sides, that far apart.
+    """
+
+    scores: ChannelScores
+    inside: tuple[tuple[float, ChannelScores], ...]
+
+    def table(self) -> str:
+        """A table per channel, and one by length of the gap."""
+        predictors = list(self.scores.rmse)
+        lines = [["gap up to", "cells", *predictors]]
+        for up_to, scores in self.inside:
+            numbers = [_shown(scores.overall[p]) for p in predictors]
+            lines.append([f"{up_to:.3g} s", str(sum(scores.cells)), *numbers])
+        by_gap = f"\nscaled, by time between the observations around:\n{_aligned(lines)}"
+        return self.scores.table() + (by_gap if self.inside else "")
+
+    def verdict(self) -> str:
+        """Which predictor is best, in words, and in which gaps a trivial one is."""
+        said = self.scores.verdict()
+        lost = []
+        for up_to, scores in self.inside:
+            value, who = min((scores.overall[p], p) for p in scores.overall)
+            if value == value and who in scores.trivial:
+                lost.append(f"{up_to:.3g} s ({who})")
+        if lost:
+            said += f"; in gaps of up to {', '.join(lost)} a trivial predictor wins"
+        return said
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form."""
+        return {
+            **self.scores.to_dict(),
+            "verdict": self.verdict(),
+            "by_gap": [
+                {"up_to_s": up_to, "cells": sum(s.cells), "rmse_scaled": dict(s.overall)}
+                for up_to, s in self.inside
+            ],
+        }
+
+
+def fills_of(
+    model: Model | TwoSided, dataset: Dataset, *, seed: int = 0
+) -> dict[str, list[NDArray[np.float64]]]:
+    """What each predictor fills in, by its name: the model, causal and two-sided; trivial ones.
+
+    Args:
+        model: a trained model, or a pair.
+        dataset: in the order of the model's channels.
+        seed: of the generator of self-feeding.
+
+    Returns:
+        Per predictor and trajectory (rows, channels) in original units.
+    """
+    forward = model.forward if isinstance(model, TwoSided) else model
+    result = {"causal": [t.values for t in impute(forward, dataset, seed=seed)]}
+    if isinstance(model, TwoSided):
+        result["two_sided"] = [t.values for t in impute(model, dataset, seed=seed)]
+    mean = training_mean(forward)
+    for method in FILLERS:
+        result[method] = [fill(t, method, mean) for t in dataset]
+    return result
+
+
+def score_imputation(
+    model: Model | TwoSided, dataset: Dataset, *, seed: int = 0
+) -> ImputationScores:
+    """Scores fills of all hidden cells, beside last value, linear interpolation and PCHIP.
+
+    Every cell that is known and hidden counts, for every predictor.
+
+    Args:
+        model: a trained model, or a pair, which is scored causal and two-sided.
+        dataset: with hidden cells, as `mask_out` makes them.
+        seed: of the generator of self-feeding.
+
+    Raises:
+        InputError: nothing is hidden, or other channels than the model's.
+    """
+    forward = model.forward if isinstance(model, TwoSided) else model
+    if dataset.names != forward.names and set(dataset.names) == set(forward.names):
+        dataset = dataset.select(forward.names)
+    if not any(masked_values(t).any() for t in dataset):
+        raise InputError(
+            "no cell is known and hidden, so no fill can be scored; hide some with thin "
+            "(--observed_fraction)"
+        )
+    fills = fills_of(model, dataset, seed=seed)
+    unit = forward.statistics.median_gap
+    sums = _sums_for(forward)
+    grouped: dict[int, ErrorSums] = {}
+    for i, trajectory in enumerate(dataset):
+        counted = masked_values(trajectory)
+        each = {name: values[i] for name, values in fills.items()}
+        sums.add(trajectory.values, each, counted)
+        length = _gap_lengths(trajectory)
+        group = np.ceil(np.log2(np.maximum(length / unit, 1.0)) - 1e-6).astype(int)
+        for k in np.unique(group[counted & (length > 0)]).tolist():
+            chosen = counted & (length > 0) & (group == k)
+            grouped.setdefault(k, _sums_for(forward)).add(trajectory.values, each, chosen)
+    inside = tuple(
+        (unit * 2.0**k, grouped[k].scores("imputation", FILLERS)) for k in sorted(grouped)
+    )
+    return ImputationScores(sums.scores("imputation", FILLERS), inside)
+
+
+def score_forecast(
+    model: Model, dataset: Dataset, horizons: ArrayLike, *, targets: int = 20
+) -> tuple[ChannelScores, ...]:
+    """Scores forecasts at fixed horizons, beside the last value and constant velocity.
+
+    For a row at time t and a horizon h, every predictor sees the rows up to t - h and is asked for
+    t; the cells of that row which are known, and whose channel had been observed by t - h, count.
+
+    Args:
+        model: trained.
+        dataset: hidden cells are not shown, and are scored like others.
+        horizons: s, above 0, strictly increasing.
+        targets: rows per trajectory and horizon, evenly spaced among those that can be scored.
+
+    Returns:
+        One record per horizon.
+
+    Raises:
+        InputError: horizons as of `extrapolate`, no row can be scored, other channels than the
+            model's, or a model that can't be asked for times.
+    """
+    if dataset.names != model.names and set(dataset.names) == set(model.names):
+        dataset = dataset.select(model.names)
+    mean = training_mean(model)
+    results = []
+    after: list[float] = checked_horizons(horizons).tolist()
+    for horizon in after:
+        tasks = [task for t in dataset for task in _targets(t, horizon, targets)]
+        name = f"extrapolation, {horizon:g} s"
+        sums = _sums_for(model)
+        if tasks:
+            pasts = Dataset(tuple(past for past, _, _, _ in tasks))
+            asked = [np.array([at]) for _, at, _, _ in tasks]
+            predicted = predict(model, pasts, times=asked)
+            for (past, at, truth, counted), said in zip(tasks, predicted, strict=True):
+                each = {model.config.name: said.values}
+                for method in FORECASTERS:
+                    each[method] = forecast(past, np.array([at]), method, mean)
+                sums.add(truth, each, counted)
+        results.append(sums.scores(name, FORECASTERS))
+    if not any(sum(scores.cells) for scores in results):
+        raise InputError(
+            f"no trajectory is long enough for a horizon of {after[0]:g} s after an observation; "
+            "use shorter horizons or longer trajectories"
+        )
+    return tuple(results)
+
+
+def training_mean(model: Model) -> list[float]:
+    """The mean of each channel over the observed cells of the training part, in its unit."""
+    mean: list[float] = model.scaler.original(np.array(model.statistics.mean)).tolist()
+    return mean
+
+
+def _sums_for(model: Model) -> ErrorSums:
+    scale = np.abs(model.scaler.scale) * np.array(model.statistics.std)
+    return ErrorSums(model.names, model.units, scale)
+
+
+def _gap_lengths(trajectory: Trajectory) -> NDArray[np.float64]:
+    """(rows, channels) s between the observations around a cell; 0 where a side is missing."""
+    times = np.where(trajectory.observed, trajectory.times[:, None], np.nan)
+    before = np.fmax.accumulate(times, axis=0)
+    after = np.fmin.accumulate(times[::-1], axis=0)[::-1]
+    length: NDArray[np.float64] = np.nan_to_num(after - before)
+    return length
+
+
+_Target = tuple[Trajectory, float, NDArray[np.float64], NDArray[np.bool_]]
+
+
+def _targets(trajectory: Trajectory, horizon: float, count: int) -> list[_Target]:
+    """Pasts, times to ask for, what is true there, and which cells of it count."""
+    times = trajectory.times
+    rows = np.searchsorted(times, times - horizon * (1 - 1e-9), side="right")
+    seen = np.logical_or.accumulate(trajectory.observed, axis=0)
+    counted = trajectory.known & seen[np.maximum(rows - 1, 0)] & (rows > 0)[:, None]
+    possible = np.flatnonzero(counted.any(axis=1))
+    if not len(possible):
+        return []
+    spread = np.linspace(0, len(possible) - 1, min(count, len(possible)))
+    return [
+        (
+            trajectory.slice(0, int(rows[row])),
+            float(times[row]),
+            np.nan_to_num(trajectory.values[row : row + 1]),
+            counted[row : row + 1],
+        )
+        for row in possible[np.unique(np.rint(spread).astype(int))]
+    ]
+
+
+def _plain(value: float) -> float | None:
+    return None if value != value else value
+
+
+def _shown(value: float) -> str:
+    return "-" if value != value else f"{value:.4g}"
+
+
+def _aligned(lines: list[list[str]]) -> str:
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(w) if i == 0 else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in lines
+    )

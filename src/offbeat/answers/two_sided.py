@@ -1,0 +1,215 @@
+"""Filling from both sides: a forward model, a backward one, and a rule that joins them.
+
+The backward model is trained on trajectories reversed in time, so it predicts a cell from what was
+observed strictly after it. Between two observations of a channel, x0 at t0 and x1 at t1, let
+s = (t - t0) / (t1 - t0), f(t) and b(t) what the two models say, and r_f = x1 - f(t1) and
+r_b = x0 - b(t0) how far off each is on arrival at the other side, which is known. The fill is
+
+    (1 - s) f + s b
+        + s (1 - s) (w1 (r_f + r_b) + w2 (1 - 2 s) (r_b - r_f) + w3 (f - b))
+        + w4 (line - (1 - s) f - s b) + w5 (curve - (1 - s) f - s b)
+
+with the straight line through x0 and x1, and PCHIP through all that was observed of the channel.
+Its first row is the inverse-variance weighting of two predictions whose error variances grow in
+proportion to the distance from the observation each comes from. The second corrects for what both
+are seen to miss: with w1 = w2 = 1/2 and models that go on straight, the fill is the cubic Hermite
+interpolation with their slopes. The last one is the way out where models know nothing that line
+and curve do not; 1 - w4 - w5 is the share of the models (`FillRule.model_share`).
+
+After the last observation of a channel the fill is f + v (x0 - f), before the first one
+b + v (x1 - b): the model's prediction, pulled towards holding the value. A channel that is never
+observed gets the mean of both predictions.
+
+The weights are the least-squares solution on hidden cells of validation data: by length of the gap
+(outside, of the distance) and channel, held by ridge towards those of all channels together, these
+towards those of all lengths, and these towards `fill_rule.START`. The strength of the ridge is, for
+each channel, the one that does best on validation trajectories left out; where the line, PCHIP or
+holding the value does better alone, the channel gets that. Where fewer than five validation
+trajectories have such a cell, nothing is chosen outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.answers.fill_rule import FillRule, NormalEquations
+from offbeat.answers.predict import predict
+from offbeat.baselines import fill
+from offbeat.data.masking import mask_out, masked_values
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.errors import InputError
+from offbeat.models.model import Model
+
+
+@dataclass(frozen=True, eq=False)
+class TwoSided:
+    """Two models of the same channels and the rule that joins what they say.
+
+    Attributes:
+        forward: predicts from what came before.
+        backward: trained on trajectories reversed in time.
+        rule: chosen on validation data.
+
+    Raises:
+        InputError: the models have different channels.
+    """
+
+    forward: Model
+    backward: Model
+    rule: FillRule
+
+    def __post_init__(self) -> None:
+        if (self.forward.names, self.forward.units) != (self.backward.names, self.backward.units):
+            raise InputError("the forward and the backward model must be of the same channels")
+        if len(self.rule.weights) != self.forward.channels:
+            raise InputError(
+                f"the rule is for {len(self.rule.weights)} channels, the models have "
+                f"{self.forward.channels}"
+            )
+
+
+def reversed_in_time(dataset: Dataset) -> Dataset:
+    """Each trajectory from its end to its start, times counted from its last row.
+
+    Args:
+        dataset: any trajectories; values stay as they are, those of velocities too.
+    """
+    return replace(
+        dataset,
+        trajectories=tuple(
+            replace(
+                t,
+                times=t.times[-1] - t.times[::-1],
+                values=t.values[::-1],
+                observed=t.observed[::-1],
+                actions=None if t.actions is None else t.actions[::-1],
+            )
+            for t in dataset
+        ),
+    )
+
+
+def fill_two_sided(pair: TwoSided, dataset: Dataset, *, seed: int = 0) -> list[_Array]:
+    """What the rule says of every cell that is not observed.
+
+    Args:
+        pair: models and rule.
+        dataset: in the order of the models' channels; hidden values are not looked at.
+        seed: of the generator of self-feeding.
+
+    Returns:
+        Per trajectory (rows, channels) in original units; NaN where the cell is observed.
+    """
+    filled = []
+    for trajectory, sides in zip(
+        dataset, _sides(pair.forward, pair.backward, dataset, seed), strict=True
+    ):
+        weights = pair.rule.weights_at(sides.side, sides.length)
+        values = sides.base + (weights * sides.terms).sum(axis=2)
+        values[trajectory.observed] = np.nan
+        filled.append(values)
+    return filled
+
+
+def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int = 0) -> FillRule:
+    """Chooses the weights of the rule, in closed form, on the hidden cells of validation data.
+
+    Args:
+        forward: trained.
+        backward: trained on reversed trajectories.
+        validation: where nothing of it is hidden, 30 % of the cells of each channel are, at random.
+        seed: of that draw, and of the generator of self-feeding.
+    """
+    if validation.names != forward.names:
+        validation = validation.select(forward.names)
+    if not any(masked_values(t).any() for t in validation):
+        validation = mask_out(validation, 0.7, hide="cells", seed=seed)
+    scale = np.abs(forward.scaler.scale) * np.array(forward.statistics.std)
+    equations = NormalEquations(forward.channels, forward.statistics.median_gap)
+    every = zip(validation, _sides(forward, backward, validation, seed), strict=True)
+    for trajectory, sides in every:
+        equations.add(
+            sides.terms / scale[:, None],
+            (trajectory.values - sides.base) / scale,
+            sides.side,
+            sides.length,
+            masked_values(trajectory) & trajectory.observed.any(axis=0),
+        )
+    return equations.rule()
+
+
+# --- what both sides say ----------------------------------------------------------------------
+
+_Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """What is known of each cell from both sides; (rows, channels) each, in original units.
+
+    Attributes:
+        side: index into `fill_rule.SIDES`.
+        length: s, between the observations on both sides; outside, to the only one.
+        base: what the fill is with weights 0.
+        terms: (rows, channels, 5) what the weights multiply.
+    """
+
+    side: NDArray[np.int64]
+    length: _Array
+    base: _Array
+    terms: _Array
+
+
+def _sides(forward: Model, backward: Model, dataset: Dataset, seed: int) -> Iterator[_Sides]:
+    ahead = predict(forward, dataset, seed=seed)
+    back = predict(backward, reversed_in_time(dataset), seed=seed)
+    for trajectory, f, b in zip(dataset, ahead, back, strict=True):
+        yield _sides_of(trajectory, f.values, b.values[::-1])
+
+
+def _sides_of(trajectory: Trajectory, f: _Array, b: _Array) -> _Sides:
+    observed, times = trajectory.observed, trajectory.times[:, None]
+    rows, at = np.arange(trajectory.rows)[:, None], np.arange(trajectory.channels)
+    earlier = np.maximum.accumulate(np.where(observed, rows, -1), axis=0)
+    later = np.minimum.accumulate(np.where(observed, rows, len(rows))[::-1], axis=0)[::-1]
+    before, after = earlier >= 0, later < len(rows)
+    earlier, later = np.maximum(earlier, 0), np.minimum(later, len(rows) - 1)
+    start, end = trajectory.times[earlier], trajectory.times[later]
+    between = before & after & ~observed
+
+    seen = np.where(observed, trajectory.values, 0.0)  # a hidden value goes nowhere from here
+    first, last = seen[earlier, at], seen[later, at]
+    length = np.where(between, end - start, 1.0)
+    s = np.where(between, (times - start) / length, 0.0)
+    hump = s * (1 - s)
+    joined = (1 - s) * f + s * b
+    missed_ahead, missed_back = last - f[later, at], first - b[earlier, at]
+    curve = fill(trajectory, "pchip", [0.0] * trajectory.channels)
+    terms = [
+        hump * (missed_ahead + missed_back),
+        hump * (1 - 2 * s) * (missed_back - missed_ahead),
+        hump * (f - b),
+        (1 - s) * first + s * last - joined,
+        curve - joined,
+    ]
+    alone = np.where(before, f, b)
+    held = np.where(before, first, last) - alone
+    one_side = before != after
+    return _Sides(
+        side=np.where(one_side, np.where(before, 1, 2), 0),
+        length=np.where(
+            between, length, np.where(one_side, np.where(before, times - start, end - times), 0.0)
+        ),
+        base=np.where(between, joined, np.where(one_side, alone, (f + b) / 2)),
+        terms=np.stack(
+            [
+                np.where(between, term, np.where(one_side & (k == 0), held, 0.0))
+                for k, term in enumerate(terms)
+            ],
+            axis=2,
+        ),
+    )

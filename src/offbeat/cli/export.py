@@ -1,0 +1,34 @@
+"""`offbeat export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from offbeat.cli.common import say
+from offbeat.errors import one_of
+
+
+def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False) -> None:
+    """Write one streaming step of a model for other programs, its state as inputs and outputs.
+
+    The file runs without torch: offbeat.OnnxStream, offbeat stream FILE, or any ONNX runtime.
+
+    Args:
+        model: folder of a run or of a checkpoint.
+        out: .onnx file to write.
+        to: onnx.
+        json: print what was written as JSON.
+    """
+    one_of("export format", to, ("onnx",))
+    one_of("suffix of out", out.suffix, (".onnx",))
+
+    from offbeat.export.exporter import export_onnx
+    from offbeat.files import writable
+    from offbeat.models.checkpoint import load_model
+
+    writable(out)
+    loaded = load_model(model)
+    export_onnx(loaded, out)
+    size = out.stat().st_size
+    result = {"written": str(out), "model": loaded.config.name, "bytes": size}
+    say(result, f"{out}: one step of {loaded.config.name}, {size} bytes", json)

@@ -1,0 +1,77 @@
+"""`offbeat forecast`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from offbeat.cli.common import (
+    answer_columns,
+    check_figure,
+    check_out,
+    drawn_channels,
+    one_trajectory,
+    read_log,
+    say,
+)
+from offbeat.errors import InputError
+
+
+def forecast_command(
+    model: Path,
+    data: Path,
+    out: Path,
+    horizons: list[float] | float | None = None,
+    figure: Path | None = None,
+    channels: list[str] | None = None,
+    trajectory: int = 0,
+    reader: dict[str, Any] | None = None,
+    json: bool = False,
+) -> None:
+    """Predict what comes after the last row of a log, in original units.
+
+    Args:
+        model: folder of a run or of a checkpoint.
+        data: the log, of any format that Offbeat reads.
+        out: .csv or .parquet file with columns trajectory, time (s), horizon (s after the last
+            row), one per channel, and one `name|observed` per channel, which is false: nothing here
+            was measured.
+        horizons: s after the last row: --horizons 0.5 or --horizons '[0.1, 0.5, 1.0]'.
+        figure: .png, .pdf or .svg of the end of one trajectory, the forecast, last value and
+            constant velocity.
+        channels: to draw; by default the first four.
+        trajectory: to draw, counted from 0.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
+            own hold for what is not given, unless a format is.
+        json: print what was written as JSON.
+    """
+    import numpy as np
+
+    from offbeat.answers.forecast import checked_horizons, forecast
+    from offbeat.cli.scored import forecast_figure
+    from offbeat.data.writers.tables import write_table
+    from offbeat.models.checkpoint import load_model
+
+    if horizons is None:
+        raise InputError("say how far to go: --horizons 0.5 or --horizons '[0.1, 0.5, 1.0]', in s")
+    check_out(out, data)
+    check_figure(figure)
+    after = checked_horizons(horizons)
+    loaded = load_model(model)
+    dataset = read_log(data, reader, run=model)
+    predicted = forecast(loaded, dataset, after)
+    chosen = drawn_channels(predicted.names, channels)
+    one_trajectory(dataset, trajectory)
+    columns = answer_columns(dataset, predicted)
+    names = list(columns)
+    at = names.index(predicted.names[0])
+    columns["horizon"] = np.tile(after, len(predicted))
+    write_table(out, {name: columns[name] for name in [*names[:at], "horizon", *names[at:]]})
+    rows = len(predicted) * len(after)
+    result = {"written": str(out), "rows": rows, "horizons_s": after.tolist()}
+    text = f"{out}: {rows} predictions, up to {after[-1]:g} s after the last row"
+    if figure is not None:
+        forecast_figure(loaded, dataset, after, figure, chosen, trajectory)
+        result["figure"] = str(figure)
+        text += f"; {figure}"
+    say(result, text, json)

@@ -1,0 +1,40 @@
+"""`offbeat simulate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from offbeat.cli.common import say
+from offbeat.errors import InputError
+
+
+def simulate_command(
+    out: Path,
+    robot: str = "hopper",
+    n_trajectories: int = 10_000,
+    rows: int = 200,
+    seed: int = 0,
+    threads: int | None = None,
+    json: bool = False,
+) -> None:
+    """Simulate a robot falling without control, and write a data set.
+
+    Args:
+        out: Parquet file to write.
+        robot: hopper or walker.
+        n_trajectories: how many, each from its own random state.
+        rows: rows per trajectory; one per physics step, 5 ms for the hopper.
+        seed: of the initial states; 123 is the draw of the thesis' protocol.
+        threads: of the simulation; all cores by default. They do not change the result.
+        json: print what was written as JSON.
+    """
+    from offbeat.data.simulate import simulate
+    from offbeat.data.store import save
+    from offbeat.files import writable
+
+    if out.suffix != ".parquet":
+        raise InputError(f"out must be a .parquet file, got {out}")
+    writable(out)
+    dataset = simulate(robot, n_trajectories, rows, seed=seed, threads=threads)
+    save(dataset, out)
+    say({"written": str(out), "meta": dict(dataset.meta)}, f"{out}: {dataset!r}", json)

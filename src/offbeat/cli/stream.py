@@ -1,0 +1,96 @@
+"""`offbeat stream`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from offbeat.config import check_seed
+from offbeat.stream.options import StreamOptions
+
+
+def stream_command(
+    model: Path,
+    policies: StreamOptions = StreamOptions(),  # noqa: B008  # frozen
+    horizon_s: float | None = None,
+    time_unit: str = "s",
+    state: Path | None = None,
+    seed: int = 0,
+    stats: bool = False,
+) -> None:
+    """Run a model live: JSON lines on standard input, an answer to each on standard output.
+
+    {"t": 0.25, "values": {"knee": 0.3}} is answered with what became of it and with a prediction.
+    Channels that are null or left out were not measured. {"predict": 0.3} predicts and consumes
+    nothing; {"reset": true}, {"counters": true}, {"state": true} and {"restore": STATE} do what
+    they say. A bad line is answered with {"error": ...}. It ends with the input or on SIGTERM,
+    after answering all that had arrived.
+
+    Args:
+        model: folder of a run or of a checkpoint, or a file that `offbeat export` wrote.
+        policies: what to do with messages that are late, repeated, stale or on another clock.
+        horizon_s: predict so many seconds after the newest row; by default each row is predicted
+            at its own time, before its values are looked at.
+        time_unit: of all times: s, ms, us or ns. Integers are exact.
+        state: JSON file with the state of a stream: taken up if it is there, written at the end.
+        seed: of the generator of self-feeding.
+        stats: print latencies and counters as JSON on standard error at the end.
+    """
+    import json
+    import os
+    import sys
+    import time
+
+    from offbeat.errors import FileFormatError
+    from offbeat.files import writable, write_json
+    from offbeat.stream.latency import Latency
+    from offbeat.stream.lines import LineSession
+    from offbeat.stream.live import LiveStream
+    from offbeat.stream.pipes import serve
+
+    check_seed(seed)
+    if state is not None:
+        writable(state)
+    stream: LiveStream
+    if model.suffix == ".onnx":
+        from offbeat.export.runner import OnnxStream
+
+        stream = OnnxStream(model, policies, time_unit=time_unit)
+    else:
+        import torch
+
+        from offbeat.models.checkpoint import load_model
+        from offbeat.stream.stream import Stream
+
+        torch.set_num_threads(1)
+        stream = Stream(load_model(model), policies, time_unit=time_unit, seed=seed)
+    if state is not None and state.exists():
+        try:
+            stream.restore(json.loads(state.read_text(encoding="utf-8")))
+        except ValueError as error:
+            raise FileFormatError(f"{state} can't be taken up: {error}") from None
+    session, latency = LineSession(stream, horizon_s=horizon_s), Latency()
+
+    def answer(line: bytes) -> bytes:
+        began = time.perf_counter_ns()
+        said = session.answer(line)
+        latency.add(time.perf_counter_ns() - began)
+        return said
+
+    sys.stdout.flush()
+    heard = serve(answer, session.refuse, source=sys.stdin.fileno(), sink=sys.stdout.fileno())
+    if not heard:
+        # The interpreter would try to flush a pipe that nobody reads.
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+    if state is not None:
+        write_json(state, stream.state())
+    if stats:
+        counted = {
+            "lines": session.lines,
+            "bad_lines": session.bad_lines,
+            "answers_heard_to_the_end": heard,
+            "latency": latency.to_dict(),
+            "counters": stream.counters.to_dict() | {"held": stream.held},
+        }
+        print(json.dumps(counted, indent=2), file=sys.stderr)

@@ -1,0 +1,105 @@
+"""`offbeat train`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from offbeat.cli.common import READER_FILE, plain, read_log, say
+from offbeat.config import ModelConfig, SplitConfig, TrainConfig, check_seed
+from offbeat.errors import InputError, one_of
+
+LONG = 2000
+"""Rows of a training trajectory from which on it is worth a word that windows train faster."""
+
+
+def train_command(
+    data: Path,
+    out: Path,
+    model: ModelConfig = ModelConfig(),  # noqa: B008  # frozen
+    training: TrainConfig = TrainConfig(),  # noqa: B008
+    split: SplitConfig = SplitConfig(),  # noqa: B008
+    scaler: str = "standardise",
+    two_sided: bool = False,
+    reader: dict[str, Any] | None = None,
+    seed: int = 0,
+    threads: int = 1,
+    json: bool = False,
+) -> None:
+    """Train a model on a data set, and score it on the part that was held out.
+
+    Args:
+        data: the log, of any format that Offbeat reads.
+        out: folder of the run: config.yaml, log.csv, checkpoints, model, results.json. A run that
+            was stopped goes on where it was.
+        model: what the model consists of; only the name is needed.
+        training: epochs, optimizer and the rest.
+        split: windows, masked cells, and the split into training, validation and test.
+        scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
+        two_sided: train a second model on reversed trajectories, too, so that impute can fill from
+            both sides; it lies in the folder backward of the run.
+        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE.
+        seed: of the initial weights.
+        threads: of torch; one is fastest for models of this size.
+        json: print the scores as JSON.
+    """
+    import torch
+    import yaml
+
+    from offbeat.answers.impute import fit_two_sided
+    from offbeat.answers.two_sided import TwoSided
+    from offbeat.cli.scored import scored
+    from offbeat.data.splits import SCALERS, apply_split, save_split
+    from offbeat.evaluation import evaluate
+    from offbeat.files import writable, write_json, write_text
+    from offbeat.models.model import Model
+    from offbeat.models.zoo import make_model
+    from offbeat.training import fit
+
+    one_of("scaler", scaler, SCALERS)
+    check_seed(seed)
+    if threads < 1:
+        raise InputError(f"threads must be an integer of at least 1, got {threads}")
+    writable(out, folder=True)
+    torch.set_num_threads(threads)
+    dataset = read_log(data, reader)
+    train_part, validation, test = apply_split(dataset, split)
+    longest = max(t.rows for t in train_part)
+    if longest > LONG:
+        print(
+            f"offbeat: note: training trajectories have up to {longest} rows, each step goes "
+            "through all of them; windows train faster: --split.window 200 --split.cut random",
+            file=sys.stderr,
+        )
+    made = make_model(model, train_part, scaler=scaler, seed=seed)  # type: ignore[arg-type]
+    resolved = {
+        "data": str(data),
+        "out": str(out),
+        "model": plain(asdict(made.config)),
+        "training": plain(asdict(training)),
+        "split": plain(asdict(split)),
+        "scaler": scaler,
+        "two_sided": two_sided,
+        "reader": reader,
+        "seed": seed,
+        "threads": threads,
+    }
+    trained: Model | TwoSided = made
+    if two_sided:
+        trained, fitted, _ = fit_two_sided(
+            made, train_part, validation, training, out=out, seed=seed
+        )
+    else:
+        fitted = fit(made, train_part, validation, training, out=out)
+    write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
+    save_split(out / "split.json", split, dataset)
+    if reader:
+        write_json(out / READER_FILE, reader)
+    evaluation = evaluate(made, test)
+    scores, text = scored(trained, test, evaluation)
+    result = {"steps": fitted.steps, "part": "test", **scores}
+    write_json(out / "results.json", result)
+    heading = f"{out}: {fitted.steps} steps; RMSE on the test part, in scaled units ({scaler})"
+    say(result, f"{heading}\n{text}", json)

@@ -1,0 +1,208 @@
+"""Run folders and tables of runs on disk, read as they are."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from offbeat.errors import FileFormatError, one_of
+
+METRICS = ("after_first_observation", "masked", "after_first_row", "published")
+"""The scorings of a run, `offbeat.metrics.SCORINGS`; repeated here to do without torch."""
+
+LAST_VALUE = "last_value"
+"""Name of the trivial predictor that is scored beside every run."""
+
+PROVENANCE = ("commit", "bits", "cpu", "kernel_body", "torch")
+"""What runs that are compared should have in common; where they have not, it is said."""
+
+_CONDITION = ("condition", "data", "experiment", "observed_fraction")
+_NOT_SETTINGS = ("seed", "checkpoint_every")
+
+
+@dataclass(frozen=True)
+class RawRun:
+    """A run before labels are made.
+
+    Attributes:
+        name: its folder, or its id in a table.
+        model: name of the model.
+        condition: what was asked of it, by name.
+        shown: those of them that stand in every label.
+        settings: of model and training, without seeds.
+        seeds: what tells repeats apart, the first as far as it does.
+        facts: all that runs may be chosen by.
+        mse: by metric, NaN where nothing counted.
+        last_value_mse: by metric.
+        draw: of windows and masks.
+        origin: of `PROVENANCE`, what is known.
+    """
+
+    name: str
+    model: str
+    condition: Mapping[str, Any]
+    shown: tuple[str, ...]
+    settings: Mapping[str, Any]
+    seeds: tuple[str, ...]
+    facts: Mapping[str, Any]
+    mse: Mapping[str, float]
+    last_value_mse: Mapping[str, float]
+    draw: str
+    origin: Mapping[str, str]
+
+
+def read_raw(path: Path) -> list[RawRun]:
+    """Reads the runs that stand at a path.
+
+    Args:
+        path: folder of a run, folder of such folders or of a record, or a table.
+
+    Raises:
+        FileFormatError: it is missing, damaged, or holds no run.
+    """
+    if path.is_dir():
+        if (path / "results.json").is_file():
+            return [_read_folder(path)]
+        for name in ("record.parquet", "record.csv"):
+            if (path / name).is_file():
+                return _read_table(path / name)
+        inside = sorted(file.parent for file in path.glob("*/results.json"))
+        if inside:
+            return [_read_folder(folder) for folder in inside]
+        raise FileFormatError(
+            f"{path} is no finished run: it holds neither results.json nor a record of runs; "
+            "'offbeat train' writes results.json when it is done"
+        )
+    if not path.exists():
+        raise FileFormatError(f"{path} is not there; give the folder of a run, or a table of runs")
+    one_of(f"suffix of {path.name}", path.suffix.lower(), (".csv", ".parquet"))
+    return _read_table(path)
+
+
+def _read_folder(folder: Path) -> RawRun:
+    import yaml
+
+    config = _load(folder / "config.yaml", yaml.safe_load)
+    results = _load(folder / "results.json", json.loads)
+    try:
+        model, parts, training = config["model"], dict(config["split"]), config["training"]
+        scores, name = results["predictors"], str(model["name"])
+        draw = str(parts.pop("seed"))
+        condition = {"data": Path(config["data"]).name, **parts, "scaler": config["scaler"]}
+        fingerprint = folder / "split.json"
+        if fingerprint.is_file():
+            condition["fingerprint"] = str(_load(fingerprint, json.loads)["data"])
+        settings = {
+            f"{part}.{key}": value
+            for part, values in (("model", model), ("training", training))
+            for key, value in values.items()
+            if key not in _NOT_SETTINGS
+        }
+        facts = {**training, **model, **condition, "model": name, "seed": config["seed"]}
+        return RawRun(
+            str(folder),
+            name,
+            condition,
+            tuple(
+                k for k in ("data", "window", "observed_fraction") if condition.get(k) is not None
+            ),
+            settings,
+            (f"parts.seed {draw}", f"seed {config['seed']}"),
+            facts,
+            {metric: _mse(scores[name][metric]) for metric in METRICS},
+            {metric: _mse(scores[LAST_VALUE][metric]) for metric in METRICS},
+            draw,
+            {key: str(results[key]) for key in PROVENANCE if key in results},
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(
+            f"{folder} is no run of 'offbeat train' ({type(error).__name__}: {error}); train again"
+        ) from None
+
+
+def _load(path: Path, parse: Callable[[str], Any]) -> Any:
+    try:
+        return parse(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileFormatError(f"{path} is missing; is {path.parent} a finished run?") from None
+    except Exception as error:  # of JSON or of YAML
+        line = " ".join(str(error).split())
+        raise FileFormatError(f"{path} is damaged ({line}); train again") from None
+
+
+def _mse(score: Mapping[str, Any]) -> float:
+    return math.nan if score["mse"] is None else float(score["mse"])
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _read_table(path: Path) -> list[RawRun]:
+    rows = _rows(path)
+    columns = set(rows[0]) if rows else set()
+    metrics = [metric for metric in METRICS if f"{metric}_mse" in columns]
+    missing = [name for name in ("model", "repeat") if name not in columns]
+    if not rows or missing or not metrics:
+        what = "has no rows" if not rows else f"lacks the columns {', '.join(missing)}"
+        if rows and not missing:
+            what = "has no column of scores"
+        raise FileFormatError(
+            f"{path} {what}; expected a row per run with model, repeat and one or more of "
+            f"{', '.join(f'{metric}_mse' for metric in METRICS)}"
+        )
+    found = []
+    for number, row in enumerate(rows, start=1):
+        where = f"row {number} of {path}"
+        trivial = {
+            metric: _number(row[f"{LAST_VALUE}_{metric}_mse"], where)
+            for metric in metrics
+            if row.get(f"{LAST_VALUE}_{metric}_mse") is not None
+        }
+        found.append(
+            RawRun(
+                str(row.get("run_id") or where),
+                str(row["model"]),
+                {key: row[key] for key in _CONDITION if key in columns},
+                tuple(key for key in _CONDITION if key in columns and key != "data"),
+                {},
+                (f"repeat {row['repeat']}",),
+                row,
+                {metric: _number(row[f"{metric}_mse"], where) for metric in metrics},
+                trivial,
+                str(row.get("seed_draw", row["repeat"])),
+                {key: str(row[key]) for key in PROVENANCE if row.get(key) is not None},
+            )
+        )
+    return found
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    text = ("run_id", "model", "condition", "data", "repeat", *PROVENANCE)
+    try:
+        if path.suffix.lower() == ".parquet":
+            table = pyarrow.parquet.read_table(path, memory_map=False)
+        else:
+            options = pyarrow.csv.ConvertOptions(
+                column_types={name: pa.string() for name in text}, strings_can_be_null=True
+            )
+            table = pyarrow.csv.read_csv(path, convert_options=options)
+        rows: list[dict[str, Any]] = table.to_pylist()
+    except (pa.ArrowException, OSError) as error:
+        line = " ".join(str(error).split())
+        raise FileFormatError(f"{path} cannot be read as a table of runs: {line}") from None
+    return rows
+
+
+def _number(value: Any, where: str) -> float:
+    try:
+        return math.nan if value is None else float(value)
+    except (TypeError, ValueError):
+        raise FileFormatError(f"{where}: {value!r} is no number, expected an error") from None

@@ -1,0 +1,322 @@
+"""From signals to episodes: clocks mended, streams merged on the union of stamps, outages cut."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.cleaning import anomalies
+from offbeat.data.cleaning import channels as repairs
+from offbeat.data.cleaning.options import CleaningLog, ReaderOptions
+from offbeat.data.signals import Recording, Signal
+from offbeat.data.trajectory import Trajectory
+from offbeat.errors import FileFormatError, InputError, one_of
+
+_DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The channels of all recordings together, in the order in which they were first met."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    columns: dict[tuple[str, str], int]  # by signal and channel
+    angles: dict[int, float]  # the full turn of each, in its unit
+    quaternions: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, recordings: list[Recording], policies: ReaderOptions) -> Channels:
+        """Collects the channels, and finds quaternions that no reader has marked.
+
+        Raises:
+            FileFormatError: there is no channel, names repeat, or units disagree.
+            InputError: `channels`, `without` or `angles` names a channel that there is not.
+        """
+        if not recordings:
+            raise FileFormatError("there is nothing recorded to read; check the file")
+        columns: dict[tuple[str, str], int] = {}
+        units: list[str] = []
+        kinds: list[str] = []
+        looked_at: set[str] = set()
+        for signal in (signal for recording in recordings for signal in recording.signals):
+            for channel, unit, kind in zip(
+                signal.channels, signal.units, signal.kinds, strict=True
+            ):
+                at = columns.setdefault((signal.name, channel), len(columns))
+                if at == len(units):
+                    units.append(unit)
+                    kinds.append(kind)
+                units[at] = units[at] or unit
+                kinds[at] = kinds[at] or kind
+                if unit not in ("", units[at]):
+                    raise FileFormatError(
+                        f"channel {channel!r} of signal {signal.name!r} is in {units[at]!r} here "
+                        f"and in {unit!r} there; read the recordings one by one"
+                    )
+            if len(signal.stamps) and signal.name not in looked_at:
+                looked_at.add(signal.name)
+                if "quaternion" not in signal.kinds:
+                    for first in repairs.find_quaternions(signal.channels, signal.values.T):
+                        for channel in signal.channels[first : first + 4]:
+                            kinds[columns[signal.name, channel]] = "quaternion"
+        several = len({signal for signal, _ in columns}) > 1
+        names = tuple(f"{s}.{c}" if several and s else c for s, c in columns)
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise FileFormatError(f"the channel name {twice!r} stands twice; names are unique")
+        if not names:
+            raise FileFormatError("there is no channel to read, only times")
+        for name in policies.angles:
+            kinds[names.index(one_of("channel in angles", name, names))] = "angle"
+        left_out = {one_of("channel in without", name, names) for name in policies.without}
+        chosen = tuple(name for name in policies.channels or names if name not in left_out)
+        if not chosen:
+            raise InputError(f"there are no channels but those to be left out: {', '.join(names)}")
+        kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
+        fours = [at for at, kind in enumerate(kinds) if kind == "quaternion"]
+        whole = [fours[i : i + 4] for i in range(0, len(fours), 4)]
+        return cls(
+            chosen,
+            tuple(units[at] for at in kept),
+            {key: kept[at] for key, at in columns.items() if at in kept},
+            {
+                kept[at]: 360.0 if units[at].casefold() in _DEGREES else 2 * np.pi
+                for at, kind in enumerate(kinds)
+                if kind == "angle" and at in kept
+            },
+            tuple(
+                tuple(kept[at] for at in four)
+                for four in whole
+                if policies.quaternions == "continuous" and all(at in kept for at in four)
+            ),
+        )
+
+    def keep(self, signal: Signal) -> Signal | None:
+        """The signal with those of its channels that are kept, or None."""
+        at = [i for i, name in enumerate(signal.channels) if (signal.name, name) in self.columns]
+        if len(at) == len(signal.channels):
+            return signal
+        names = tuple(signal.channels[i] for i in at)
+        return Signal(signal.name, signal.stamps, signal.values[:, at], names) if at else None
+
+    def names_of(self, columns: Iterable[int]) -> tuple[str, ...]:
+        """The names of some columns."""
+        return tuple(self.names[c] for c in columns)
+
+
+@dataclass
+class Episode:
+    """A stretch of a recording, its signals merged."""
+
+    stamps: NDArray[np.int64]
+    values: NDArray[np.float64]
+    owned: bool  # whether values may be written to
+    recording: Recording = field(repr=False)
+    part: str = ""
+    faults: dict[str, float] = field(default_factory=dict)  # found here, by what they are called
+
+    @property
+    def label(self) -> str:
+        """That of the recording, with the number of the part where it was split."""
+        return f"{self.recording.label}/{self.part}" if self.part else self.recording.label
+
+    def own(self) -> NDArray[np.float64]:
+        """The values, copied first where they are not the episode's to write to."""
+        if not self.owned:
+            self.values, self.owned = self.values.copy(order="F"), True
+        return self.values
+
+    def trajectory(self, channels: Channels, policies: ReaderOptions) -> Trajectory:
+        """Seconds from integer nanoseconds, checked.
+
+        Raises:
+            FileFormatError: a trajectory can't be made, for rows are less than float64 can tell
+                apart.
+        """
+        zero = self.stamps[0] if policies.start == "first_row" else 0
+        part = f", part {self.part}" if self.part else ""
+        origin = f"{self.recording.origin}{part}"
+        try:
+            return Trajectory(
+                (self.stamps - zero) / 1e9,
+                self.values,
+                actions=_held_actions(self.recording.actions, self.stamps),
+                names=channels.names,
+                units=channels.units,
+                origin=origin,
+            )
+        except InputError as error:
+            raise FileFormatError(str(error)) from None
+
+
+def _held_actions(actions: Signal | None, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """(rows, actions) the action that held at each stamp: the last one up to it, or the first."""
+    if actions is None:
+        return None
+    if np.array_equal(actions.stamps, stamps):
+        return actions.values
+    order = np.argsort(actions.stamps, kind="stable")
+    held = np.searchsorted(actions.stamps[order], stamps, side="right") - 1
+    return actions.values[order[np.maximum(held, 0)]]
+
+
+def cut(
+    recording: Recording, channels: Channels, policies: ReaderOptions, account: CleaningLog
+) -> list[Episode]:
+    """The episodes of a recording: its clocks mended, its signals merged, split at outages."""
+    kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
+    signals = [signal for signal in kept if signal is not None]
+    if not signals:
+        account.empty += 1
+        return []
+    found: list[Episode] = []
+    bare = replace(recording, signals=(), notes=())
+    for piece in _pieces(signals, recording, policies, account):
+        ordered = [_ordered(signal, recording, policies, account) for signal in piece]
+        columns = [[channels.columns[s.name, c] for c in s.channels] for s in piece]
+        stamps, values = anomalies.union(
+            [(*o, c) for o, c in zip(ordered, columns, strict=True)], len(channels.names)
+        )
+        owned = values is not ordered[0][1] or values is not piece[0].values
+        if any(np.isinf(column).any() for column in values.T):
+            values, owned = _without_infinite(values, owned, recording, channels, policies, account)
+        disorders = [anomalies.disorder(signal.stamps) for signal in piece]
+        limit = anomalies.longest_allowed(stamps, policies.max_gap_s)
+        cuts = np.zeros(0, dtype=np.int64)
+        if limit is not None:
+            account.limits_s.append(limit / 1e9)
+            steps = np.diff(stamps)
+            cuts = np.flatnonzero(steps > limit) + 1
+            account.outages_s += (steps[cuts - 1] / 1e9).tolist()
+        for start, end in zip([0, *cuts], [*cuts, len(stamps)], strict=True):
+            episode = Episode(stamps[start:end], values[start:end], owned, bare)
+            episode.faults = _faults_in(episode.stamps, disorders)
+            if start:
+                episode.faults["outage_before_s"] = float(stamps[start] - stamps[start - 1]) / 1e9
+            elif found:
+                episode.faults["clock_set_before"] = 1
+            found.append(episode)
+    if len(found) == 1:
+        return found
+    long = [episode for episode in found if len(episode.stamps) >= policies.min_rows]
+    account.left_out += [len(e.stamps) for e in found if len(e.stamps) < policies.min_rows]
+    for k, episode in enumerate(long, 1):
+        episode.part = str(k)
+    return long
+
+
+def _faults_in(
+    stamps: NDArray[np.int64], disorders: Iterable[anomalies.Disorder]
+) -> dict[str, float]:
+    """How many rows between the first and the last stamp came late, or repeat one."""
+    counts: dict[str, float] = {}
+    for found in disorders:
+        for name, at in (("late", found.late), ("duplicates", found.duplicates)):
+            count = int(((at >= stamps[0]) & (at <= stamps[-1])).sum()) if len(at) else 0
+            if count:
+                counts[name] = counts.get(name, 0) + count
+    return counts
+
+
+def _pieces(
+    signals: list[Signal], recording: Recording, policies: ReaderOptions, account: CleaningLog
+) -> list[list[Signal]]:
+    """Signals cut where the clock was set, each piece with the stretches that belong together."""
+    cuts = [anomalies.clock_jumps(signal.stamps) for signal in signals]
+    most = max(range(len(signals)), key=lambda i: len(cuts[i]))
+    account.clock_jumps += len(cuts[most])
+    if not len(cuts[most]) or policies.clock_jumps == "join":
+        return [signals]
+    if policies.clock_jumps == "refuse":
+        row, stamps = int(cuts[most][0]), signals[most].stamps
+        raise FileFormatError(
+            f"{_where(signals[most], recording)}the clock was set from {_seconds(stamps[row - 1])} "
+            f"to {_seconds(stamps[row])} s at row {row}; clock_jumps=split begins a new episode"
+        )
+    pieces: list[list[Signal]] = [[] for _ in range(len(cuts[most]) + 1)]
+    spans = [(s.min(), s.max()) for s in np.split(signals[most].stamps, cuts[most])]
+    for signal, cut in zip(signals, cuts, strict=True):
+        bounds = [0, *cut.tolist(), len(signal.stamps)]
+        for k, (start, end) in enumerate(itertools.pairwise(bounds)):
+            stretch = Signal(
+                signal.name,
+                signal.stamps[start:end],
+                signal.values[start:end],
+                signal.channels,
+                signal.units,
+                signal.kinds,
+            )
+            low, high = stretch.stamps.min(), stretch.stamps.max()
+            shared = [min(high, top) - max(low, bottom) for bottom, top in spans]
+            at = k if len(cut) == len(cuts[most]) else int(np.argmax(shared))
+            pieces[at].append(stretch)
+    return pieces
+
+
+def _ordered(
+    signal: Signal, recording: Recording, policies: ReaderOptions, account: CleaningLog
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    found = anomalies.disorder(signal.stamps)
+    if not found.any:
+        return signal.stamps, signal.values
+    refused = (len(found.late) and policies.order == "refuse") or (
+        len(found.duplicates) and policies.duplicates == "refuse"
+    )
+    if refused:
+        stamps = signal.stamps
+        if policies.order != "refuse":
+            stamps = np.sort(stamps)
+        row = int(np.argmax(np.diff(stamps) <= 0)) + 1
+        raise FileFormatError(
+            f"{_where(signal, recording)}times must increase strictly, got "
+            f"{_seconds(stamps[row - 1])} s at row {row - 1} and {_seconds(stamps[row])} s at row "
+            f"{row}; order=sort sorts late rows in, duplicates=last merges those of one stamp"
+        )
+    name = signal.name or (signal.channels[0] if len(signal.channels) == 1 else "rows")
+    if len(found.late):
+        account.late[name] += len(found.late)
+    stamps, values = anomalies.in_order(signal.stamps, signal.values, policies.order)
+    before = len(stamps)
+    stamps, values = anomalies.one_row_per_stamp(stamps, values, policies.duplicates)
+    if before > len(stamps):
+        account.duplicates[name] += before - len(stamps)
+    return stamps, values
+
+
+def _without_infinite(
+    values: NDArray[np.float64],
+    owned: bool,
+    recording: Recording,
+    channels: Channels,
+    policies: ReaderOptions,
+    account: CleaningLog,
+) -> tuple[NDArray[np.float64], bool]:
+    infinite = np.isinf(values)
+    if policies.infinite == "refuse":
+        row, channel = np.argwhere(infinite)[0]
+        raise FileFormatError(
+            f"{recording.origin}: values are infinite at row {row}, channel "
+            f"{channels.names[channel]!r}; infinite=missing takes such cells as missing"
+        )
+    account.infinite += int(infinite.sum())
+    values = values if owned else values.copy(order="F")
+    values[infinite] = np.nan
+    return values, True
+
+
+def _where(signal: Signal, recording: Recording) -> str:
+    name = f", signal {signal.name}" if signal.name else ""
+    return f"{recording.origin}{name}: " if recording.origin or name else ""
+
+
+def _seconds(stamp: Any) -> str:
+    """A stamp in seconds, to the nanosecond."""
+    whole, rest = divmod(abs(int(stamp)), 10**9)
+    sign = "-" if stamp < 0 else ""
+    return f"{sign}{whole}.{rest:09d}".rstrip("0").rstrip(".")

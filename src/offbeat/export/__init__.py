@@ -1,0 +1,1 @@
+"""ONNX: a model's step as one file, and what runs it."""

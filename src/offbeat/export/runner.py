@@ -1,0 +1,169 @@
+"""`OnnxStream`: an exported model, live, on onnxruntime and without torch."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.splits import Scaler
+from offbeat.errors import FileFormatError, require
+from offbeat.stream.engine import Arrays, Engine
+from offbeat.stream.live import Frame, LiveStream
+from offbeat.stream.options import StreamOptions, with_options
+
+FORMAT = "offbeat-step"
+VERSION = 1
+METADATA = "offbeat"
+"""Key in the metadata of the file, where a JSON object stands."""
+
+STATE = ("state", "time", "start", "observed_at", "channel_at", "last", "updated")
+"""Inputs that hold the state; each comes out again with `_next`."""
+
+_BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at": -np.inf}
+
+
+class OnnxStream(LiveStream):
+    """A model that `export_onnx` wrote, fed with messages as they come: `Stream` without torch.
+
+    Args:
+        path: the .onnx file.
+        policies: what to do with messages out of order.
+        time_unit: of all times given: s, ms, us or ns. Integers are exact.
+        **options: fields of `StreamOptions` that replace those of `policies`.
+
+    Raises:
+        FileFormatError: the file is missing, damaged, or not written by `export_onnx`.
+        InputError: an unknown unit or option, or a policy out of its range.
+        MissingExtraError: onnxruntime is not installed.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        policies: StreamOptions | None = None,
+        *,
+        time_unit: str = "s",
+        **options: Any,
+    ) -> None:
+        engine = OnnxEngine(path)
+        super().__init__(
+            engine,
+            engine.frame,
+            policies=with_options(policies, options),
+            time_unit=time_unit,
+        )
+
+
+class OnnxEngine(Engine):
+    """Runs the step of an ONNX file, on one thread; it scales by itself.
+
+    Args:
+        path: the .onnx file.
+
+    Raises:
+        FileFormatError: as `OnnxStream`.
+        MissingExtraError: onnxruntime is not installed.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        runtime = require("onnxruntime", "export")
+        path = Path(path)
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise FileFormatError(f"{path} can't be read ({error.strerror})") from None
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        try:
+            session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            facts = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
+            self.frame, self._initial = _read(facts)
+        except FileFormatError:
+            raise
+        except Exception as error:  # onnxruntime has an exception of its own for every fault
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            raise FileFormatError(
+                f"{path} is not a model that offbeat export wrote, or damaged ({what})"
+            ) from None
+        self._session, self._digest = session, hashlib.sha256(data).hexdigest()
+        self._unmeasured = np.full((1, len(self.frame.names)), np.nan)
+        self._next = [f"{name}_next" for name in STATE]
+        self._slots: list[Arrays] = []
+        self.reset()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Values go in as they are, in original units."""
+        return np.dtype(np.float64)
+
+    def reserve(self, slots: int) -> None:
+        """Makes room for references: states are never changed, only followed by others."""
+        self._slots = [{}] * slots
+
+    def reset(self) -> None:
+        """Begins anew."""
+        self._state = dict(self._initial)
+
+    def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
+        """Consumes one row."""
+        row = np.where(mask, values, np.nan)[None]
+        found = self._session.run(self._next, {"t": np.array([time]), "values": row, **self._state})
+        self._state = dict(zip(STATE, found, strict=True))
+
+    def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The step with nothing measured, its state thrown away, for each time."""
+        feed = {"values": self._unmeasured, **self._state}
+        each = [self._session.run(["prediction"], {"t": t[None], **feed})[0] for t in times]
+        return np.concatenate(each)
+
+    def save(self, slot: int) -> None:
+        """Keeps a reference to the state."""
+        self._slots[slot] = self._state
+
+    def load(self, slot: int) -> None:
+        """Goes back to a state that was kept."""
+        self._state = self._slots[slot]
+
+    def export(self) -> Arrays:
+        """The inputs that hold the state."""
+        return {name: array.copy() for name, array in self._state.items()}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Takes the inputs that hold the state."""
+        self._state = dict(arrays)
+
+    def fingerprint(self) -> str:
+        """Of the file."""
+        return self._digest
+
+
+def _read(facts: Any) -> tuple[Frame, Arrays]:
+    """What the metadata says: the frame of the stream, and the state before anything was seen."""
+    if facts["format"] != FORMAT or facts["version"] != VERSION:
+        raise FileFormatError(
+            f"the ONNX file is a {facts['format']!r} of version {facts['version']!r}, this Offbeat "
+            f"runs {FORMAT!r} of version {VERSION}; export the model again"
+        )
+    names = tuple(facts["names"])
+    dtype = np.dtype(facts["dtype"])
+    initial: Arrays = {
+        name: np.array(values, dtype=dtype) for name, values in facts["initial"].items()
+    }
+    shapes = {"channel_at": (1, len(names))}
+    for name, value in _BEGINS.items():
+        initial[name] = np.full(shapes.get(name, (1,)), value)
+    initial["updated"] = np.zeros(1, dtype=bool)
+    frame = Frame(
+        names=names,
+        units=tuple(facts["units"]),
+        scaler=Scaler.identity(len(names)),
+        median_gap=float(facts["median_gap_s"]),
+        elapsed_limit=float(facts["elapsed_limit_s"]),
+    )
+    return frame, {name: initial[name] for name in STATE}

@@ -1,1 +1,0 @@
-"""Inference: predictions, filled gaps, forecasts, and the same live."""

@@ -1,0 +1,338 @@
+"""The compiled backend of the scan: all rows, forward and backward, in one call of compiled code.
+
+The compiled module holds a body per instruction set and runs the best one that the processor has.
+Blocks of trajectories run through all rows by themselves, spread over `torch.get_num_threads()`
+threads; the result does not depend on how many, bit for bit. A trajectory's result depends neither
+on its batch mates nor on its place in the batch, and the rows of a stream give the bits of a batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import lru_cache
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from offbeat.kernels.spec import (
+    QUANTITIES,
+    Layers,
+    ScanSpec,
+    ScanWeights,
+    StepInputs,
+    TableSteps,
+)
+from offbeat.ode import tableau
+
+try:
+    from offbeat.kernels import _fused as _compiled
+except ImportError as _error:  # built without a compiler
+    compiled: Any = None
+    why_not = str(_error)
+else:
+    compiled = _compiled
+    why_not = ""
+
+TAPE_LIMIT = 256 * 2**20
+"""Bytes. A forward pass that would keep more than this for its backward pass keeps only the states
+(`state_size` floats per row, twice), and the backward pass computes the rest again, a few rows at a
+time (`benchmarks/scaling.py` says what that costs)."""
+
+ROWS_AT_ONCE = 0
+"""Rows whose gradients of weights are added up in one go; more of them wait in memory. 0: eight
+evaluations, whichever rows those are (`benchmarks/scaling.py` says what others cost). It changes no
+bit: each sum has its order."""
+
+_CELLS = {"none": 0, "set": 1, "elman": 2, "lstm": 3, "gru": 4}
+_ACTIVATIONS = {"tanh": 0, "silu": 1}
+_DECAY_ROWS = {"continuous": 0, "every_row": 1, "observed_rows": 2}
+_TYPES = {torch.float32: "f32", torch.float64: "f64"}
+_MOST_LAYERS = 16
+
+
+_threads: ContextVar[int | None] = ContextVar("offbeat_threads", default=None)
+
+
+def threads() -> int:
+    """Threads of the compiled code: as many as torch has, or as `own_threads` found it to have."""
+    own = _threads.get()
+    return torch.get_num_threads() if own is None else own
+
+
+@contextmanager
+def own_threads() -> Iterator[None]:
+    """Gives torch's threads to the compiled code within a `with` block, and leaves torch one.
+
+    Torch's idle threads spin for a while before they sleep, on the very cores that the scan is
+    about to use, and what torch has to do beside the scan is too small to be worth a second thread.
+    """
+    count = torch.get_num_threads()
+    if compiled is None or count == 1:
+        yield
+        return
+    token = _threads.set(count)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+        _threads.reset(token)
+
+
+def instruction_sets() -> list[str]:
+    """Names of the instruction sets that this processor can run, best first."""
+    return list(compiled.bodies()) if compiled is not None else []
+
+
+def suffix(dtype: torch.dtype) -> str:
+    """What the compiled module calls a type."""
+    return _TYPES[dtype]
+
+
+def unsupported(
+    spec: ScanSpec, weights: ScanWeights, rows: StepInputs | TableSteps, state: Tensor
+) -> str:
+    """Why the compiled backend can't run a scan; empty where it can."""
+    if compiled is None:
+        return f"it was not built ({why_not})"
+    if spec.field and tableau(spec.solver).adaptive:
+        return f"the solver {spec.solver} chooses its own steps"
+    if spec.field and spec.adjoint:
+        return "gradients are asked for by the adjoint method"
+    if max(len(spec.field), len(spec.decoder)) > _MOST_LAYERS + 1:
+        return f"a perceptron has more than {_MOST_LAYERS} layers"
+    if state.device.type != "cpu" or state.dtype not in _TYPES:
+        return f"the state is {state.dtype} on {state.device}, not float32 or float64 on the CPU"
+    trained, known = tuple(weights.tensors()), tuple(rows.known())
+    if not trained:
+        return "it has no weights"
+    if any(t.dtype != state.dtype or t.device != state.device for t in (*trained, *known)):
+        return "weights, rows and state differ in type or device"
+    if any(t.requires_grad for t in known):
+        return "a gradient is asked for of what is known of a row"
+    return ""
+
+
+def scan(
+    spec: ScanSpec,
+    weights: ScanWeights,
+    rows: StepInputs | TableSteps,
+    state: Tensor,
+    body: str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Carries a batch of states over all rows, as `offbeat.kernels.scan`.
+
+    Args:
+        spec: see there.
+        weights: see there.
+        rows: see there.
+        state: see there.
+        body: name of a compiled backend; by default the best one.
+
+    Raises:
+        RuntimeError: the compiled backend can't run this scan.
+        ValueError: shapes disagree.
+    """
+    reason = unsupported(spec, weights, rows, state)
+    if reason:
+        raise RuntimeError(f"the compiled backend can't run this scan: {reason}")
+    result = _Scan.apply(  # type: ignore[no-untyped-call]
+        spec, rows, body or instruction_sets()[0], torch.is_grad_enabled(), weights.packed(), state
+    )
+    return cast("tuple[Tensor, Tensor]", result)
+
+
+@lru_cache(maxsize=64)
+def compiled_spec(spec: ScanSpec) -> Any:
+    """The compiled module's form of a spec."""
+    scheme = tableau(spec.solver)
+    return compiled.Spec(
+        channels=spec.channels,
+        hidden=spec.hidden_size,
+        anchored=spec.anchors,
+        ages=spec.ages,
+        cell=_CELLS[spec.cell],
+        reset_after=spec.reset_after,
+        field=list(spec.field),
+        activation=_ACTIVATIONS[spec.activation],
+        a=[list(row) for row in scheme.a],
+        b=list(scheme.b),
+        steps=spec.steps_per_gap,
+        max_step=spec.max_step or 0.0,
+        decay_features=spec.decay,
+        decay_rows=_DECAY_ROWS[spec.decay_rows],
+        input_decay=spec.input_decay,
+        decoder=list(spec.decoder),
+    )
+
+
+def _array(tensor: Tensor | None) -> Any:
+    """A view that the compiled module takes without a copy; its last axis lies in one piece."""
+    if tensor is None:
+        return None
+    if tensor.ndim and tensor.shape[-1] > 1 and tensor.stride(-1) != 1:
+        tensor = tensor.contiguous()
+    return tensor.detach().numpy()
+
+
+def _facts(rows: StepInputs | TableSteps, suffix: str) -> Any:
+    made = getattr(compiled, f"Facts_{suffix}")
+    fed = torch.frombuffer(bytearray(rows.fed), dtype=torch.uint8).numpy() if rows.fed else None
+    if isinstance(rows, TableSteps):
+        table = rows.table
+        return made(
+            _array(table.table),
+            _array(rows.index),
+            table.columns,
+            rows.rows,
+            _array(table.mean),
+            fed,
+            _array(rows.length),
+        )
+    facts = (_array(getattr(rows, name)) for name in QUANTITIES)
+    return made(*facts, _array(rows.mean), fed, _array(rows.length))
+
+
+class _Scan(Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        spec: ScanSpec,
+        rows: StepInputs | TableSteps,
+        body: str,
+        keep: bool,
+        packed: Tensor,
+        state: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        own = compiled_spec(spec)
+        facts = _facts(rows, _TYPES[state.dtype])
+        state = state.contiguous()
+        first = _array(state)
+        before = state.new_empty((len(rows), rows.rows, spec.state_size))
+        after = torch.empty_like(before)
+        tape = None
+        if keep:
+            size = compiled.tape_size(own, body, facts, first)
+            if size * state.element_size() <= TAPE_LIMIT:
+                tape = state.new_empty(size)
+        ctx.threads = threads()
+        compiled.scan_forward(
+            own, body, _array(packed), facts, first, _array(before), _array(after), _array(tape),
+            ctx.threads,
+        )  # fmt: skip
+        ctx.own, ctx.facts, ctx.body, ctx.rows = own, facts, body, rows
+        # What is returned must be kept this way: as attributes it would never be freed.
+        ctx.save_for_backward(packed, state, after, tape)
+        ctx.set_materialize_grads(False)
+        return before, after
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_before: Tensor | None, to_after: Tensor | None) -> tuple[Any, ...]:
+        packed, state, after, tape = ctx.saved_tensors
+        to_packed, to_state = torch.empty_like(packed), torch.empty_like(state)
+        compiled.scan_backward(
+            ctx.own,
+            ctx.body,
+            _array(packed),
+            ctx.facts,
+            _array(state),
+            _array(after),
+            _array(tape),
+            _array(to_before),
+            _array(to_after),
+            _array(to_packed),
+            _array(to_state),
+            ctx.threads,
+            ROWS_AT_ONCE,
+        )
+        return None, None, None, None, to_packed, to_state
+
+
+# --- a perceptron over many rows ------------------------------------------------------------------
+
+
+def perceptron(layers: Layers, x: Tensor, activation: str, body: str | None = None) -> Tensor:
+    """Applies a perceptron to (..., inputs); a row's result depends on that row alone, bit for bit.
+
+    Args:
+        layers: weights and biases.
+        x: (..., inputs) float32 or float64 on the CPU.
+        activation: `tanh` or `silu`, between the layers.
+        body: name of a compiled backend; by default the best one.
+    """
+    sizes = (layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers))
+    packed = torch.cat([tensor.reshape(-1) for layer in layers for tensor in layer])
+    flat = x.reshape(-1, sizes[0])
+    result = _Perceptron.apply(  # type: ignore[no-untyped-call]
+        sizes, activation, body or instruction_sets()[0], torch.is_grad_enabled(), packed, flat
+    )
+    return cast(Tensor, result).reshape(*x.shape[:-1], sizes[-1])
+
+
+def supports_perceptron(layers: Layers, x: Tensor) -> bool:
+    """True where `perceptron` can run."""
+    return (
+        compiled is not None
+        and x.device.type == "cpu"
+        and x.dtype in _TYPES
+        and x.numel() > 0
+        and len(layers) <= _MOST_LAYERS
+        and all(t.dtype == x.dtype and t.device == x.device for layer in layers for t in layer)
+    )
+
+
+@lru_cache(maxsize=64)
+def compiled_perceptron(sizes: tuple[int, ...], activation: str) -> Any:
+    """The compiled module's form of a perceptron."""
+    return compiled.Perceptron(list(sizes), _ACTIVATIONS[activation])
+
+
+class _Perceptron(Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        sizes: tuple[int, ...],
+        activation: str,
+        body: str,
+        keep: bool,
+        packed: Tensor,
+        x: Tensor,
+    ) -> Tensor:
+        shape = compiled_perceptron(sizes, activation)
+        y = x.new_empty((len(x), sizes[-1]))
+        tape = None
+        if keep:
+            size = getattr(compiled, f"perceptron_tape_{_TYPES[x.dtype]}")(shape, body, len(x))
+            tape = x.new_empty(size)
+        ctx.threads = threads()
+        compiled.perceptron_forward(
+            shape, body, _array(packed), _array(x), _array(y), _array(tape), ctx.threads
+        )
+        ctx.shape, ctx.body = shape, body
+        ctx.save_for_backward(packed, x, tape)
+        return y
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_y: Tensor) -> tuple[Any, ...]:
+        packed, x, tape = ctx.saved_tensors
+        to_packed = torch.empty_like(packed)
+        to_x = x.new_empty(x.shape) if ctx.needs_input_grad[-1] else None
+        compiled.perceptron_backward(
+            ctx.shape,
+            ctx.body,
+            _array(packed),
+            _array(x),
+            _array(tape),
+            _array(to_y.contiguous()),
+            _array(to_packed),
+            _array(to_x),
+            ctx.threads,
+        )
+        return None, None, None, None, to_packed, to_x

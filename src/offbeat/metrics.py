@@ -1,0 +1,213 @@
+"""Scores of predictions against a batch: what counts, by name.
+
+`after_first_observation` is the default everywhere. `after_first_row` and `published` stand beside it because published
+numbers use them; `docs/deviations.md` says what they contain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from offbeat.data.batch import Batch, delta, last_index, last_values
+
+SCORINGS = ("after_first_observation", "masked", "after_first_row", "published")
+"""The scorings, always by these names."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """A mean squared error, in scaled units.
+
+    Attributes:
+        mse: over all cells that count; NaN when there is none.
+        per_channel: the same per channel.
+        cells: how many cells counted.
+    """
+
+    mse: float
+    per_channel: tuple[float, ...]
+    cells: int
+
+    @property
+    def rmse(self) -> float:
+        """Root of the mean squared error."""
+        return float(self.mse**0.5)
+
+
+@dataclass(frozen=True)
+class GapScore:
+    """The score after the first observation, of the entries whose channel was last observed within a range of ages.
+
+    Attributes:
+        above: s, age is above this.
+        up_to: s, and at most this.
+        score: of those cells.
+    """
+
+    above: float
+    up_to: float
+    score: Score
+
+
+@dataclass(frozen=True)
+class Scores:
+    """All scorings of one predictor on one data set.
+
+    Attributes:
+        after_first_observation: known cells after their channel's first observation, observed or hidden.
+        masked: those of them that are hidden.
+        after_first_row: known cells of all rows but the first.
+        published: all rows, where the prediction of row 0 is the observed row 0, filled with zeros
+            where it is hidden: what the thesis reports.
+        by_gap: after the first observation, by the age of the channel's last observation.
+    """
+
+    after_first_observation: Score
+    masked: Score
+    after_first_row: Score
+    published: Score
+    by_gap: tuple[GapScore, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form; a score without cells has null for its error."""
+        result: dict[str, Any] = {name: _plain(getattr(self, name)) for name in SCORINGS}
+        result["by_gap"] = [
+            {"above_s": g.above, "up_to_s": g.up_to, **_plain(g.score)} for g in self.by_gap
+        ]
+        return result
+
+
+def _plain(score: Score) -> dict[str, Any]:
+    def number(value: float) -> float | None:
+        return None if value != value else value
+
+    return {
+        "mse": number(score.mse),
+        "rmse": number(score.rmse),
+        "cells": score.cells,
+        "per_channel_mse": [number(v) for v in score.per_channel],
+    }
+
+
+class ScoreSums:
+    """Adds up squared errors batch by batch, in float64.
+
+    Args:
+        channels: number of channels.
+        gap_unit: s; ages are grouped at 1, 2, 4, 8, ... times this. None leaves `by_gap` empty.
+    """
+
+    def __init__(self, channels: int, *, gap_unit: float | None = None) -> None:
+        self.channels = channels
+        self.gap_unit = gap_unit
+        self._sums: dict[str | int, tuple[Tensor, Tensor]] = {}
+
+    def add(self, predictions: Tensor, batch: Batch) -> None:
+        """Adds a batch.
+
+        Args:
+            predictions: (batch, rows, channels) in the units of `batch.values`.
+            batch: what was observed and what is known.
+        """
+        squared = (predictions.double() - batch.values.double()) ** 2
+        known = batch.known & batch.valid[..., None]
+        mask = batch.mask & batch.valid[..., None]
+        seen = last_index(mask) >= 0
+        counted = known & seen
+        self._add("after_first_observation", squared, counted)
+        self._add("masked", squared, counted & ~mask)
+        later = known.clone()
+        later[:, 0] = False
+        self._add("after_first_row", squared, later)
+        shown = torch.where(mask[:, 0], 0.0, batch.values[:, 0].double() ** 2)
+        self._add("published", torch.cat([shown[:, None], squared[:, 1:]], dim=1), known)
+        if self.gap_unit is not None:
+            age = delta(batch.times, mask) / self.gap_unit
+            group = torch.ceil(torch.log2(age.clamp_min(1.0)) - 1e-6).long()
+            for k in torch.unique(group[counted]).tolist():
+                self._add(int(k), squared, counted & (group == k))
+
+    def _add(self, name: str | int, squared: Tensor, counts: Tensor) -> None:
+        total = torch.where(counts, squared, 0.0).sum(dim=(0, 1))
+        count = counts.sum(dim=(0, 1))
+        if name in self._sums:
+            total, count = self._sums[name][0] + total, self._sums[name][1] + count
+        self._sums[name] = (total, count)
+
+    def scores(self) -> Scores:
+        """The scores of everything added so far."""
+        unit = self.gap_unit or 0.0
+        groups = sorted(k for k in self._sums if isinstance(k, int))
+        by_gap = tuple(
+            GapScore(unit * 2.0 ** (k - 1) if k else 0.0, unit * 2.0**k, self._score(k))
+            for k in groups
+        )
+        named = {name: self._score(name) for name in SCORINGS}
+        return Scores(**named, by_gap=by_gap)
+
+    def _score(self, name: str | int) -> Score:
+        if name not in self._sums:
+            return Score(float("nan"), (float("nan"),) * self.channels, 0)
+        total, count = self._sums[name]
+        cells = int(count.sum())
+        mse = float(total.sum()) / cells if cells else float("nan")
+        return Score(mse, tuple((total / count).tolist()), cells)
+
+
+def last_value_predictions(batch: Batch, mean: Tensor) -> Tensor:
+    """The trivial predictor: repeat each channel's last observed value, the mean before any.
+
+    Args:
+        batch: scaled.
+        mean: (channels,) training mean, scaled.
+
+    Returns:
+        (batch, rows, channels).
+    """
+    mask = batch.mask & batch.valid[..., None]
+    return last_values(batch.values, mask, before=mean.to(batch.values))
+
+
+def row_0_constant(batch: Batch) -> float:
+    """The c of `published = (1 - 1/rows) after_first_row + c (hidden share of rows 0) / rows`.
+
+    The mean square of those rows 0 that are hidden, for whole rows hidden and equal lengths.
+    """
+    hidden = batch.known[:, 0] & ~batch.mask[:, 0]
+    return float((batch.values[:, 0].double()[hidden] ** 2).mean())
+
+
+def _shown(rmse: float) -> str:
+    if rmse != rmse:
+        return "-"
+    return f"{rmse:.4f}" if rmse < 1e4 else f"{rmse:.2e}"
+
+
+def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None) -> str:
+    """A plain-text table of scores, one line per predictor, best score after the first observation first.
+
+    Args:
+        rows: scores by predictor.
+        notes: a remark per predictor, shown at the end of its line.
+    """
+    titles = ("predictor", "RMSE", "masked only", "after row 0", "published")
+    lines: list[tuple[str, ...]] = [titles]
+    ranked = sorted(rows.items(), key=lambda item: item[1].after_first_observation.mse)
+    for name, scores in ranked:
+        numbers = (_shown(getattr(scores, s).rmse) for s in SCORINGS)
+        lines.append((name, *numbers))
+    widths = [max(len(line[i]) for line in lines) for i in range(len(titles))]
+    text = []
+    for name_, line in zip(("", *(name for name, _ in ranked)), lines, strict=True):
+        cells = (
+            c.ljust(w) if i == 0 else c.rjust(w)
+            for i, (c, w) in enumerate(zip(line, widths, strict=True))
+        )
+        note = (notes or {}).get(name_, "")
+        text.append("  ".join([*cells, note]).rstrip())
+    return "\n".join(text)

@@ -1,0 +1,172 @@
+"""ElapsedTimes and gaps at every row, and what carries them, with the state, to the rows that follow.
+
+By default nothing moves before the first observation: the model's clock starts there. After it,
+time since the last observed row saturates at a limit, and a gap is the growth of that saturated
+time. So rows in which nothing is observed can stand anywhere and change nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from offbeat.data.batch import Batch, last_index
+
+
+@dataclass(frozen=True, eq=False)
+class RecurrentState:
+    """Everything a model takes from the rows it has seen to the rows to come.
+
+    Attributes:
+        state: (batch, state_size).
+        time: (batch,) float64, s, of the last row; NaN before the first.
+        start: (batch,) float64, s, at which the clock started; +inf before.
+        observed_at: (batch,) float64, s, of the last observed row; -inf before the first.
+        channel_at: (batch, channels) float64, s, of each channel's last observation; -inf before.
+        last: (batch, channels) last observed value of each channel; the training mean before.
+        updated: (batch,) bool, True if the cell acted at the last row.
+        rows: number of rows seen.
+        generator: generator of the generator of self-feeding, or None.
+    """
+
+    state: Tensor
+    time: Tensor
+    start: Tensor
+    observed_at: Tensor
+    channel_at: Tensor
+    last: Tensor
+    updated: Tensor
+    rows: int = 0
+    generator: torch.Generator | None = None
+
+    @classmethod
+    def empty(
+        cls, state: Tensor, mean: Tensor, *, generator: torch.Generator | None = None
+    ) -> RecurrentState:
+        """Nothing seen yet.
+
+        Args:
+            state: (batch, state_size) the state before anything is observed.
+            mean: (channels,) stands for a value never observed.
+            generator: generator of the generator of self-feeding.
+        """
+        batch, device = len(state), state.device
+
+        def full(value: float, *shape: int) -> Tensor:
+            return torch.full((batch, *shape), value, dtype=torch.float64, device=device)
+
+        inf = float("inf")
+        return cls(
+            state,
+            full(float("nan")),
+            full(inf),
+            full(-inf),
+            full(-inf, len(mean)),
+            mean.expand(batch, -1),
+            torch.zeros(batch, dtype=torch.bool, device=device),
+            generator=generator,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ElapsedTimes:
+    """What follows from times and masks alone; all times in s, float64.
+
+    Attributes:
+        observed: (batch, rows) bool, True where any channel is observed.
+        first: (batch, rows) bool, True at the first observed row.
+        step: (batch, rows) since the row before, as it stands in the data.
+        gap: (batch, rows) growth of the saturated time since the last observed row.
+        elapsed: (batch, rows) saturated time since the last observed row, on arrival at the row.
+        elapsed_before: (batch, rows) the same at the row before, after its observation.
+        delta: (batch, rows, channels) age of each channel (equation 25) on arrival; over a gap it
+            grows as long as `elapsed` does.
+        delta_before: (batch, rows, channels) the same at the row before, after its observation.
+        last: (batch, rows, channels) last value of each channel on arrival.
+    """
+
+    observed: Tensor
+    first: Tensor
+    step: Tensor
+    gap: Tensor
+    elapsed: Tensor
+    elapsed_before: Tensor
+    delta: Tensor
+    delta_before: Tensor
+    last: Tensor
+
+
+def ages(
+    batch: Batch,
+    carry: RecurrentState,
+    *,
+    elapsed_limit: float,
+    from_first_row: bool = False,
+) -> tuple[ElapsedTimes, RecurrentState]:
+    """ElapsedTimes at each row of a batch that continues what `carry` has seen.
+
+    Args:
+        batch: rows to come, in order.
+        carry: what was seen before; its `state` and `updated` are passed on as they are.
+        elapsed_limit: s, at which the time since the last observed row saturates.
+        from_first_row: the clock starts at the first row, observed or not.
+    """
+    times = batch.times
+    mask = batch.mask & batch.valid[..., None]
+    observed = mask.any(dim=2)
+    index, row_index = last_index(mask), last_index(observed[..., None])[..., 0]
+    spread = times[..., None].expand(index.shape)
+
+    channel_at = _pick(spread, index, carry.channel_at[:, None])
+    observed_at = _pick(times, row_index, carry.observed_at[:, None])
+    last = _pick(batch.values, index, carry.last[:, None])
+    before = torch.cat([carry.time[:, None], times[:, :-1]], dim=1)
+    before = torch.where(before.isnan(), times, before)
+
+    inf = float("inf")
+    starts = batch.valid if from_first_row else observed
+    earliest = torch.where(starts, times, inf).min(dim=1).values
+    start = torch.minimum(carry.start, earliest)
+    clock = torch.maximum(observed_at, start[:, None])
+    channel_clock = torch.maximum(channel_at, start[:, None, None])
+    elapsed, lost = _saturate(times - clock, elapsed_limit)
+    elapsed_before, lost_before = _saturate(before - clock, elapsed_limit)
+    delta = spread - lost[..., None] - channel_clock
+    delta_before = (before - lost_before)[..., None] - channel_clock
+    result = ElapsedTimes(
+        observed=observed,
+        first=observed & (row_index < 0) & carry.observed_at.isneginf()[:, None],
+        step=times - before,
+        gap=elapsed - elapsed_before,
+        elapsed=elapsed,
+        elapsed_before=elapsed_before,
+        delta=delta.clamp_min(0),
+        delta_before=delta_before.clamp_min(0),
+        last=last,
+    )
+    carried = RecurrentState(
+        state=carry.state,
+        time=times[:, -1],
+        start=start,
+        observed_at=torch.where(observed[:, -1], times[:, -1], observed_at[:, -1]),
+        channel_at=torch.where(mask[:, -1], spread[:, -1], channel_at[:, -1]),
+        last=torch.where(mask[:, -1], batch.values[:, -1], last[:, -1]),
+        updated=carry.updated,
+        rows=carry.rows + batch.rows,
+        generator=carry.generator,
+    )
+    return result, carried
+
+
+def _saturate(elapsed: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Time that counts, from 0 to the limit, and the time beyond the limit that does not."""
+    elapsed = elapsed.clamp_min(0)
+    counted = elapsed.clamp_max(limit)
+    return counted, elapsed - counted
+
+
+def _pick(values: Tensor, index: Tensor, otherwise: Tensor) -> Tensor:
+    """`values` along dimension 1 at `index`; `otherwise` where the index is -1."""
+    return torch.where(index >= 0, values.gather(1, index.clamp_min(0)), otherwise)

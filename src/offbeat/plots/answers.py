@@ -1,0 +1,138 @@
+"""A figure of fills and forecasts: what was observed, what was hidden, what was answered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from offbeat.data.masking import masked_values
+from offbeat.data.trajectory import Trajectory
+from offbeat.errors import InputError, one_of
+from offbeat.plots.style import RC, STYLES, style_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LONGEST_LABEL = 24
+"""Characters of a channel's name and unit that fit beside a panel; longer ones stand above it."""
+
+
+def answers(
+    truth: Trajectory,
+    answered: Mapping[str, Trajectory],
+    channels: Sequence[str],
+    *,
+    title: str = "",
+) -> Figure:
+    """Draws channels over time: observed cells, hidden ones, and what predictors put there.
+
+    A predictor is drawn where its `observed` is False: what it says of cells that were measured is
+    no answer. Lines break where a cell was observed.
+
+    Args:
+        truth: observed cells are black, cells that are known and hidden are hollow.
+        answered: per predictor a trajectory on the same clock.
+        channels: names of the channels to draw, one panel each.
+        title: stands above the panels.
+
+    Raises:
+        InputError: no channel is asked for, or one that a trajectory lacks.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    if not channels:
+        raise InputError(f"name at least one channel to draw, of: {', '.join(truth.names)}")
+    for trajectory in (truth, *answered.values()):
+        for name in channels:
+            one_of("channel", name, trajectory.names)
+    with rc_context(RC):
+        figure = Figure(figsize=(7.0, 0.9 + 1.6 * len(channels)), layout="constrained")
+        panels = figure.subplots(len(channels), sharex=True, squeeze=False)[:, 0]
+        for axes, name in zip(panels, channels, strict=True):
+            _channel(axes, truth, answered, name)
+        panels[-1].set_xlabel("Time (s)")
+        figure.align_ylabels(panels)
+        if title:
+            figure.suptitle(title, fontsize=9.5)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], name: str) -> None:
+    channel = truth.names.index(name)
+    hidden = masked_values(truth)[:, channel]
+    seen = truth.observed[:, channel]
+    drawn = [truth.values[seen | hidden, channel]]
+    black = STYLES["truth"].colour
+    for model, trajectory in answered.items():
+        at, style = trajectory.names.index(name), style_of(model)
+        times, values = _with_ends(trajectory, at, truth, channel)
+        drawn.append(trajectory.values[~trajectory.observed[:, at], at])
+        axes.plot(
+            times,
+            values,
+            color=style.colour,
+            linestyle=style.dash,
+            linewidth=1.2,
+            marker="." if trajectory.rows == 1 else "",
+            label=style.label,
+            zorder=3,
+        )
+    if hidden.any():
+        axes.plot(
+            truth.times[hidden],
+            truth.values[hidden, channel],
+            linestyle="none",
+            marker="o",
+            markersize=3.4,
+            markerfacecolor="white",
+            markeredgecolor="#7F7F7F",
+            markeredgewidth=0.8,
+            label="Hidden truth",
+            zorder=2,
+        )
+    axes.plot(
+        truth.times[seen],
+        truth.values[seen, channel],
+        linestyle="none",
+        marker="o",
+        markersize=2.6,
+        color=black,
+        label="Observed",
+        zorder=4,
+    )
+    unit = truth.units[channel]
+    label = f"{name} ({unit})" if unit else name
+    if len(label) <= LONGEST_LABEL:
+        axes.set_ylabel(label)
+    else:  # a topic's field, say: written along the axis it would run into the next panel
+        axes.set_title(label, loc="left", fontsize=8.5)
+    axes.margins(x=0.01)
+    together = np.concatenate(drawn)
+    together = together[np.isfinite(together)]
+    if len(together):
+        margin = 0.08 * float(np.ptp(together)) or 1.0
+        axes.set_ylim(together.min() - margin, together.max() + margin)
+
+
+def _with_ends(
+    trajectory: Trajectory, at: int, truth: Trajectory, channel: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The line of a predictor: its answers, tied to the observed cells beside them."""
+    times, values = trajectory.times, trajectory.values[:, at].copy()
+    filled = ~trajectory.observed[:, at]
+    beside = np.zeros(len(filled), dtype=bool)
+    beside[1:] |= filled[:-1]
+    beside[:-1] |= filled[1:]
+    values[~(filled | beside)] = np.nan
+    seen = np.flatnonzero(truth.observed[:, channel])
+    if filled.all() and len(seen) and times[0] > truth.times[seen[-1]]:  # a forecast
+        last = seen[-1]
+        times = np.concatenate([truth.times[last : last + 1], times])
+        values = np.concatenate([truth.values[last : last + 1, channel], values])
+    return times, values

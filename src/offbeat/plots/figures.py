@@ -1,0 +1,206 @@
+"""Figures of journal size. They draw what they are given, and touch no state of pyplot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol
+
+import numpy as np
+
+from offbeat.data.trajectory import Trajectory
+from offbeat.errors import InputError, one_of
+from offbeat.files import atomic_path
+from offbeat.plots.style import RC, STYLES, style_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_WIDTH = 7.0  # inches, two columns of a journal
+_METADATA = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+
+
+class LoggedEpoch(Protocol):
+    """What a figure reads of a line of a training log."""
+
+    @property
+    def epoch(self) -> int:
+        """Counted from 1."""
+
+    @property
+    def steps(self) -> int:
+        """Optimizer steps so far."""
+
+    @property
+    def validation_mse(self) -> float:
+        """In scaled units."""
+
+
+def learning_curves(
+    histories: Mapping[str, Sequence[LoggedEpoch]],
+    *,
+    last_value_rmse: float | None = None,
+    x: Literal["epochs", "steps"] = "epochs",
+    units: str = "scaled units",
+) -> Figure:
+    """Draws the validation error of each model while it trains, on a logarithmic axis.
+
+    Args:
+        histories: per model its training log, one entry per epoch.
+        last_value_rmse: honest RMSE of the last-value predictor on the same validation part,
+            drawn as a dashed horizontal line.
+        x: count `epochs` or optimizer `steps`.
+        units: of the error, as the axis names them.
+
+    Raises:
+        InputError: there is no model, or a log is empty.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
+    one_of("x axis", x, ("epochs", "steps"))
+    empty = [name for name, history in histories.items() if not history]
+    if empty or not histories:
+        what = f"the log of {empty[0]!r} is empty" if empty else "got no training logs"
+        raise InputError(f"learning curves need at least one epoch per model; {what}")
+    with rc_context(RC):
+        figure = Figure(figsize=(_WIDTH, 3.6), layout="constrained")
+        axes = figure.add_subplot()
+        # Best last value first, so that the legend reads like the table.
+        for name in sorted(histories, key=lambda n: histories[n][-1].validation_mse):
+            history, style = histories[name], style_of(name)
+            axes.plot(
+                [entry.epoch if x == "epochs" else entry.steps for entry in history],
+                [entry.validation_mse**0.5 for entry in history],
+                color=style.colour,
+                linestyle=style.dash,
+                marker=style.marker,
+                label=style.label,
+            )
+        if last_value_rmse is not None:
+            style = style_of("last_value")
+            axes.axhline(
+                last_value_rmse, color=style.colour, linestyle=style.dash, label=style.label
+            )
+        axes.set_yscale("log")
+        axes.set_xlim(left=0)
+        axes.set_xlabel("Epoch" if x == "epochs" else "Optimizer steps")
+        axes.set_ylabel(f"Honest validation RMSE ({units})")
+        axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
+        # An error seldom spans a decade: label 1, 2, 3, 5 of each, in plain numbers.
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        figure.legend(loc="outside right upper")
+    return figure
+
+
+def predictions(
+    truth: Trajectory,
+    predictions: Mapping[str, Trajectory],
+    channels: Sequence[str],
+    *,
+    title: str = "",
+) -> Figure:
+    """Draws channels over time: the truth, what was observed of it, and what models predicted.
+
+    A panel is as high as the truth and the predictions after the channel's first observation need:
+    what a model says before it has seen anything may leave the panel.
+
+    Args:
+        truth: with the observed cells marked.
+        predictions: per model a trajectory of the same channels, on the same clock.
+        channels: names of the channels to draw, one panel each.
+        title: stands above the panels.
+
+    Raises:
+        InputError: no channel is asked for, or one that a trajectory lacks.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    if not channels:
+        raise InputError(f"name at least one channel to draw, of: {', '.join(truth.names)}")
+    for trajectory in (truth, *predictions.values()):
+        for name in channels:
+            one_of("channel", name, trajectory.names)
+    with rc_context(RC):
+        figure = Figure(figsize=(_WIDTH, 0.9 + 1.45 * len(channels)), layout="constrained")
+        panels = figure.subplots(len(channels), sharex=True, squeeze=False)[:, 0]
+        for axes, name in zip(panels, channels, strict=True):
+            _channel(axes, truth, predictions, name)
+        panels[-1].set_xlabel("Time (s)")
+        figure.align_ylabels(panels)
+        if title:
+            figure.suptitle(title, fontsize=9.5)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _channel(
+    axes: Axes, truth: Trajectory, predictions: Mapping[str, Trajectory], name: str
+) -> None:
+    channel = truth.names.index(name)
+    observed = truth.observed[:, channel]
+    first_seen = truth.times[observed][0] if observed.any() else -np.inf
+    counted = [truth.values[:, channel]]
+    black = STYLES["truth"]
+    axes.plot(
+        truth.times, truth.values[:, channel], color=black.colour, linewidth=1.8, label=black.label
+    )
+    for model, predicted in predictions.items():
+        style = style_of(model)
+        values = predicted.values[:, predicted.names.index(name)]
+        counted.append(values[predicted.times > first_seen])
+        axes.plot(
+            predicted.times,
+            values,
+            color=style.colour,
+            linestyle=style.dash,
+            linewidth=1.1,
+            label=style.label,
+        )
+    axes.plot(
+        truth.times[observed],
+        truth.values[observed, channel],
+        linestyle="none",
+        marker="o",
+        markersize=4,
+        markerfacecolor="white",
+        markeredgecolor=black.colour,
+        markeredgewidth=0.9,
+        label="Observed",
+        zorder=4,
+    )
+    unit = truth.units[channel]
+    axes.set_ylabel(f"{name} ({unit})" if unit else name)
+    axes.margins(x=0.01)
+    together = np.concatenate(counted)
+    if not np.isnan(together).all():
+        low, high = np.nanmin(together), np.nanmax(together)
+        margin = 0.08 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Writes a figure atomically, in the format that the suffix of `path` names.
+
+    The same figure gives the same bytes: no dates are written.
+
+    Args:
+        figure: to write.
+        path: ends in `.png` (200 dots per inch), `.pdf` or `.svg`.
+
+    Raises:
+        InputError: another suffix.
+    """
+    from matplotlib import rc_context
+
+    path = Path(path)
+    suffix = one_of("suffix of a figure", path.suffix.lower(), _METADATA)
+    with rc_context(RC), atomic_path(path) as temporary:
+        figure.savefig(temporary, format=suffix[1:], dpi=200, metadata=_METADATA[suffix])
+    return path

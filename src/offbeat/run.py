@@ -1,0 +1,258 @@
+"""A training run: all of it that changes, and how it is kept in a folder and taken up again."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from offbeat.config import TrainConfig
+from offbeat.data.batch import Batch
+from offbeat.errors import InputError
+from offbeat.files import write_text
+from offbeat.kernels import backend
+from offbeat.models.checkpoint import load_training_state, save_training_state
+from offbeat.models.model import Model
+
+
+@dataclass(frozen=True)
+class EpochRecord:
+    """One line of the log.
+
+    Attributes:
+        epoch: counted from 1.
+        steps: optimizer steps so far.
+        train_mse: mean over the epoch's batches, scaled units, rows after the first.
+        validation_mse: NaN without a validation part.
+        validation_after_first_row_mse: the same, all rows but the first.
+        validation_published_mse: the same, the thesis' scoring.
+        learning_rate: at the end of the epoch.
+        seconds: wall time of the epoch.
+    """
+
+    epoch: int
+    steps: int
+    train_mse: float
+    validation_mse: float
+    validation_after_first_row_mse: float
+    validation_published_mse: float
+    learning_rate: float
+    seconds: float
+
+
+class FlatParameters:
+    """All parameters of a model as one, so that an optimizer's step is a few operations in all.
+
+    Attributes:
+        flat: every parameter, in the order of `model.parameters()`; its gradient is theirs.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._own = list(model.parameters())
+        flat = torch.cat([p.detach().reshape(-1) for p in self._own])
+        self.flat = torch.nn.Parameter(flat)
+        self.gradient = torch.zeros_like(flat)
+        self.flat.grad = self.gradient
+        at = 0
+        for p in self._own:
+            end = at + p.numel()
+            p.data = flat[at:end].view_as(p)
+            p.grad = self.gradient[at:end].view_as(p)
+            at = end
+
+    def zero_gradient(self) -> None:
+        """Before a step; what a backward pass finds is added in place."""
+        self.gradient.zero_()
+
+    def release(self) -> None:
+        """Gives each parameter its own memory again."""
+        for p in self._own:
+            p.data = p.data.clone()
+            p.grad = None
+
+
+@contextmanager
+def flat_parameters(model: Model) -> Iterator[FlatParameters]:
+    """Lets a model's parameters lie in one piece while it is trained.
+
+    Args:
+        model: whose parameters.
+    """
+    parameters = FlatParameters(model)
+    try:
+        yield parameters
+    finally:
+        parameters.release()
+
+
+class RunState:
+    """All of a training run that changes, beside the model: what a checkpoint must hold.
+
+    Args:
+        parameters: what the optimizer moves.
+        config: names the optimizer.
+    """
+
+    def __init__(self, parameters: FlatParameters, config: TrainConfig) -> None:
+        self.parameters = parameters
+        self.optimizer = _optimizer(parameters.flat, config)
+        self.epoch = 0  # epochs done
+        self.step = 0  # steps done within the epoch
+        self.total_steps = 0
+        self.loss_sum = 0.0
+        self.seconds = 0.0
+        self.history: list[EpochRecord] = []
+        self.best_mse = math.inf
+        self.best_epoch = 0
+        self.best: dict[str, Tensor] = {}
+
+
+def _optimizer(flat: torch.nn.Parameter, config: TrainConfig) -> torch.optim.Optimizer:
+    kinds: dict[str, Any] = {
+        "adamax": torch.optim.Adamax,
+        "adam": torch.optim.Adam,
+        "adamw": torch.optim.AdamW,
+        "sgd": torch.optim.SGD,
+    }
+    optimizer: torch.optim.Optimizer = kinds[config.optimizer](
+        [flat], lr=config.learning_rate, foreach=True
+    )
+    return optimizer
+
+
+def identity_of(model: Model, config: TrainConfig, batch: Batch) -> dict[str, Any]:
+    """What must be the same for a run to go on: anything else would end in other numbers.
+
+    Args:
+        model: as it stands before the first step.
+        config: of the training.
+        batch: the training part.
+    """
+    weights = hashlib.sha256()
+    for value in model.state_dict().values():
+        weights.update(value.detach().cpu().numpy().tobytes())
+    identity: dict[str, Any] = {
+        "model": asdict(model.config),
+        "train": asdict(config),
+        "initial_weights": weights.hexdigest(),
+        "trajectories": len(batch),
+        "observed_cells": int(batch.mask.sum()),
+        "checksum": float(batch.values.double().sum() + batch.times.sum()),
+    }
+    if config.schedule == "constant":
+        identity["train"].pop("epochs")  # such a run can be trained for longer
+    plain: dict[str, Any] = json.loads(json.dumps(identity))  # lists for tuples, as it is read back
+    return plain
+
+
+def save_run(folder: Path, model: Model, state: RunState, identity: dict[str, Any]) -> None:
+    """Writes a checkpoint of a run, and then removes the one before.
+
+    Args:
+        folder: of the run.
+        model: as it stands.
+        state: of its training.
+        identity: from `identity_of`.
+    """
+    tensors = {f"best.{k}": v for k, v in state.best.items()}
+    for name, value in state.optimizer.state.get(state.parameters.flat, {}).items():
+        tensors[f"optimizer.{name}"] = torch.as_tensor(value)
+    facts = {
+        "identity": identity,
+        "epoch": state.epoch,
+        "step": state.step,
+        "total_steps": state.total_steps,
+        "loss_sum": state.loss_sum,
+        "seconds": state.seconds,
+        "best_mse": state.best_mse if math.isfinite(state.best_mse) else None,
+        "best_epoch": state.best_epoch,
+        "history": [
+            {k: None if v != v else v for k, v in asdict(record).items()}
+            for record in state.history
+        ],
+        "torch_threads": torch.get_num_threads(),
+        "scan_backend": backend()[0],
+    }
+    checkpoints = folder / "checkpoints"
+    name = f"steps-{state.total_steps:09d}"
+    save_training_state(model, tensors, facts, checkpoints / name)
+    for old in sorted(checkpoints.glob("steps-*")):
+        if old.name != name:
+            shutil.rmtree(old)
+
+
+def resume_run(folder: Path, model: Model, state: RunState, identity: dict[str, Any]) -> None:
+    """Takes up the last checkpoint of a run, if there is one.
+
+    Args:
+        folder: of the run.
+        model: gets the weights of the checkpoint.
+        state: gets all else.
+        identity: from `identity_of`.
+
+    Raises:
+        InputError: the checkpoint is of a run that differs in what matters, or the folder holds
+            something else.
+        FileFormatError: the checkpoint is damaged.
+    """
+    checkpoints = sorted((folder / "checkpoints").glob("steps-*"))
+    if not checkpoints:
+        others = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if others - {"tensorboard", "checkpoints"}:
+            raise InputError(
+                f"{folder} is not empty and holds no run ({', '.join(sorted(others)[:3])}, ...); "
+                "give a new folder"
+            )
+        return
+    weights, tensors, facts = load_training_state(checkpoints[-1])
+    for part, now in identity.items():
+        if facts["identity"].get(part) != now:
+            raise InputError(
+                f"{folder} holds a run with another {_difference(facts['identity'].get(part), now)}"
+                f" ({part}); give the same, or another folder"
+            )
+    model.load_state_dict(weights)
+    prefix = "optimizer."
+    moments = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
+    if moments:
+        state.optimizer.state[state.parameters.flat] = moments
+    state.best = {k[len("best.") :]: v for k, v in tensors.items() if k.startswith("best.")}
+    for name in ("epoch", "step", "total_steps", "loss_sum", "seconds", "best_epoch"):
+        setattr(state, name, facts[name])
+    state.best_mse = math.inf if facts["best_mse"] is None else facts["best_mse"]
+    for record in facts["history"]:
+        fields_: dict[str, Any] = {k: math.nan if v is None else v for k, v in record.items()}
+        state.history.append(EpochRecord(**fields_))
+    write_log(folder, state.history)
+
+
+def _difference(then: Any, now: Any) -> str:
+    if isinstance(then, dict) and isinstance(now, dict):
+        keys = [k for k in now if then.get(k) != now[k]]
+        return ", ".join(f"{k} ({then.get(k)!r} then, {now[k]!r} now)" for k in keys)
+    return f"value ({then!r} then, {now!r} now)"
+
+
+def write_log(folder: Path, history: list[EpochRecord]) -> None:
+    """Writes `log.csv`, a line per epoch.
+
+    Args:
+        folder: of the run.
+        history: one record per epoch.
+    """
+    text = io.StringIO()
+    log = csv.writer(text, lineterminator="\n")
+    log.writerow([f.name for f in fields(EpochRecord)])
+    log.writerows([getattr(record, f.name) for f in fields(EpochRecord)] for record in history)
+    write_text(folder / "log.csv", text.getvalue())

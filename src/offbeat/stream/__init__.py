@@ -1,0 +1,1 @@
+"""Streams: a trained model, live."""

@@ -1,0 +1,146 @@
+"""Runs a model row by row in compiled code, in buffers that are made once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from offbeat.kernels import backend, cpu
+from offbeat.models.model import Model
+from offbeat.parts.decay import TrainableDecay
+from offbeat.stream.engine import Arrays, Engine
+from offbeat.stream.torch_engine import TorchEngine
+
+_AGES = {"none": 0, "elapsed": 1, "gap": 2, "delta": 3}
+
+
+class CpuEngine(Engine):
+    """The same bits as a batch in the compiled backend, a row at a time.
+
+    Args:
+        model: its weights are copied; changes to the model afterwards are not seen.
+        seed: of the generator of self-feeding.
+    """
+
+    def __init__(self, model: Model, *, seed: int = 0) -> None:
+        self._model, self._seed = model, seed
+        config, spec = model.config, model.spec
+        self._dtype = np.dtype(str(model.dtype).removeprefix("torch."))
+        self._share = float(config.self_feeding or 0.0)
+        limit, statistics = float(config.gap_limit or 1), model.statistics
+        decoder, decoder_weights = [], None
+        if model.decoder is not None:
+            layers = model.decoder.layers
+            decoder = [layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers)]
+            decoder_weights = _flat([t for layer in layers for t in layer])
+        with torch.no_grad():
+            self._live = getattr(cpu.compiled, f"Live_{cpu.suffix(model.dtype)}")(
+                spec=cpu.compiled_spec(spec),
+                body=backend()[0],
+                weights=_flat(list(model.scan_weights().tensors())),
+                mean=model.mean.numpy(),
+                std=model.std.numpy(),
+                decoder=decoder,
+                decoder_weights=decoder_weights,
+                first_state=model.first_state(1)[0].detach().contiguous().numpy(),
+                unit=model.time_unit,
+                age_unit=model.time_input_unit,
+                elapsed_limit=statistics.longest_elapsed * limit,
+                longest_delta=statistics.longest_delta * limit,
+                age=_AGES[config.time_input or "none"],
+                from_first_row=config.clock == "first_row",
+                last_row=config.readout == "last_row",
+                every_row=config.update_rows == "every",
+                starts_only=config.cell == "none",
+                exponential=bool(spec.decay) and not isinstance(model.decay, TrainableDecay),
+            )
+        self._coins: torch.Generator | None = None
+        self._kept: list[torch.Tensor | None] = []
+        self.reset()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the model's weights."""
+        return self._dtype
+
+    def reserve(self, slots: int) -> None:
+        """Makes room for copies of the state."""
+        self._live.reserve(slots)
+        self._kept = [None] * slots
+
+    def reset(self) -> None:
+        """Begins anew, with the first coin."""
+        self._live.reset()
+        self._coins = torch.Generator().manual_seed(self._seed) if self._share else None
+
+    def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
+        """Consumes one row."""
+        fed = False
+        if self._coins is not None:
+            fed = float(torch.rand((), generator=self._coins)) < self._share
+            fed = fed and self._live.rows > 0
+        self._live.observe(time, values, mask, fed)
+
+    def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Each time by itself, from the state as it stands."""
+        out = np.empty((len(times), self._model.channels))
+        self._live.predict(times, out)
+        return out
+
+    def save(self, slot: int) -> None:
+        """Copies the state to a slot."""
+        self._live.save(slot)
+        self._kept[slot] = None if self._coins is None else self._coins.get_state()
+
+    def load(self, slot: int) -> None:
+        """Copies a slot to the state."""
+        self._live.load(slot)
+        kept = self._kept[slot]
+        if self._coins is not None and kept is not None:
+            self._coins.set_state(kept)
+
+    def export(self) -> Arrays:
+        """The parts of the carry, named as those of `TorchEngine`."""
+        flat = np.empty(self._live.size)
+        self._live.export_to(flat)
+        arrays: Arrays = {}
+        at = 0
+        for name, shape, kind in self._parts():
+            n = int(np.prod(shape))
+            arrays[name] = flat[at : at + n].reshape(shape).astype(kind)
+            at += n
+        if self._coins is not None:
+            arrays["generator"] = self._coins.get_state().numpy().copy()
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Takes the parts of a carry."""
+        parts = [arrays[name].astype(np.float64).reshape(-1) for name, _, _ in self._parts()]
+        self._live.restore(np.concatenate(parts))
+        if self._coins is not None:
+            self._coins.set_state(torch.tensor(arrays["generator"]))
+
+    def fingerprint(self) -> str:
+        """As `TorchEngine` says: a state of the one can be restored in the other."""
+        return TorchEngine(self._model).fingerprint()
+
+    def _parts(self) -> list[tuple[str, tuple[int, ...], Any]]:
+        states, channels = self._model.spec.state_size, self._model.channels
+        return [
+            ("state", (1, states), self._dtype),
+            ("time", (1,), np.float64),
+            ("start", (1,), np.float64),
+            ("observed_at", (1,), np.float64),
+            ("channel_at", (1, channels), np.float64),
+            ("last", (1, channels), self._dtype),
+            ("updated", (1,), np.bool_),
+            ("rows", (), np.int64),
+        ]
+
+
+def _flat(tensors: list[torch.Tensor]) -> NDArray[Any]:
+    flat: NDArray[Any] = torch.cat([t.detach().reshape(-1) for t in tensors]).numpy()
+    return flat

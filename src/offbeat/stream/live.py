@@ -1,0 +1,233 @@
+"""The stream itself, whatever runs the model: rows in the order of time out of messages in any."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from offbeat.data.splits import Scaler
+from offbeat.errors import DivergenceError, InputError
+from offbeat.stream.engine import Engine
+from offbeat.stream.messages import RowReader, Time, Values
+from offbeat.stream.options import Outcome, StreamCounters, StreamOptions
+from offbeat.stream.placing import Placement
+
+FORMAT = "offbeat-stream"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a stream must know of its model.
+
+    Attributes:
+        names: of the channels.
+        units: of the channels.
+        scaler: maps original units to those of the engine.
+        median_gap: s, between the rows of the training part.
+        elapsed_limit: s without an observation, at which the model's time saturates.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    scaler: Scaler
+    median_gap: float
+    elapsed_limit: float
+
+
+class LiveStream:
+    """Feeds messages to an engine, one row at a time; `Stream` and `OnnxStream` are public.
+
+    Memory does not grow. One thread at a time: calls must not overlap.
+
+    Args:
+        engine: runs the model.
+        frame: what must be known of it.
+        policies: what to do with messages out of order.
+        time_unit: of all times given: s, ms, us or ns.
+    """
+
+    def __init__(
+        self, engine: Engine, frame: Frame, *, policies: StreamOptions, time_unit: str
+    ) -> None:
+        self.names, self.units, self.policies = frame.names, frame.units, policies
+        self._engine, self._frame = engine, frame
+        self._reader = RowReader(frame.names, frame.scaler, engine.dtype)
+        self._placing = Placement(
+            engine,
+            policies,
+            names=frame.names,
+            time_unit=time_unit,
+            median_gap=frame.median_gap,
+            elapsed_limit=frame.elapsed_limit,
+        )
+        self._clock, self._history = self._placing.clock, self._placing.history
+
+    @property
+    def time_unit(self) -> str:
+        """Of all times given to this stream."""
+        return self._clock.unit
+
+    @property
+    def time(self) -> Time | None:
+        """Of the newest row, in the unit of the stream; None before the first."""
+        return self._placing.time
+
+    def after(self, horizon_s: float) -> Time | None:
+        """The time so many seconds after the newest row; None before the first."""
+        rows = self._history.rows
+        return self._clock.at(self._history.newest + horizon_s) if rows else None
+
+    @property
+    def counters(self) -> StreamCounters:
+        """A copy of the counts so far."""
+        return replace(self._placing.counters)
+
+    @property
+    def held(self) -> int:
+        """Messages kept aside until it is clear whether the clock has jumped."""
+        return len(self._placing.held)
+
+    def observe(self, t: Time, values: Values, *, now: Time | None = None) -> Outcome:
+        """Takes what was measured at a time.
+
+        Args:
+            t: when, in the unit of the stream; an integer is exact.
+            values: channel to value, or one value per channel, in original units. NaN, None and
+                channels that are left out were not measured.
+            now: what the clock says on arrival, for `stale_after_s`.
+
+        Returns:
+            What became of the message.
+
+        Raises:
+            InputError: a time that is no finite number, an unknown channel, a value that is no
+                number, or what the policies call an error. The message has changed nothing then.
+            DivergenceError: an adaptive solver could not keep its tolerance. The message has
+                changed nothing then.
+        """
+        t = self._clock.read(t)
+        row, mask, measured, not_finite = self._reader.read(values)
+        waited = -math.inf if now is None else self._clock.between(self._clock.read(now), t)
+        if waited > (self.policies.stale_after_s or math.inf):
+            outcome = self._placing.drop("stale")
+        else:
+            outcome = self._placing.take(t, row, mask, measured)
+        counters = self._placing.counters
+        counters.messages += 1
+        counters.not_finite += not_finite
+        counters.empty += measured == 0
+        return outcome
+
+    def step(
+        self, t: Time, values: Values, *, now: Time | None = None
+    ) -> tuple[Outcome, NDArray[np.float64] | None]:
+        """Predicts a row, then takes it: `observe`, with the prediction that was made before it.
+
+        Args:
+            t: as in `observe`.
+            values: as in `observe`; the prediction is made before they are looked at.
+            now: as in `observe`.
+
+        Returns:
+            What became of the message; and where it is a `new` row, (channels,) predicted for it
+            in original units, one step ahead.
+
+        Raises:
+            InputError: as `observe`.
+            DivergenceError: as `observe` and `predict`.
+        """
+        predicted: list[NDArray[np.float64]] = []
+
+        def before_row(time: float) -> None:
+            predicted.append(self._predict(np.array([time]))[0])
+
+        self._placing.before_row = before_row
+        try:
+            outcome = self.observe(t, values, now=now)
+        finally:
+            self._placing.before_row = None
+        return outcome, predicted[-1] if outcome == "new" else None
+
+    def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
+        """Predicts the channels at a time, from all that was observed; consumes nothing.
+
+        It is what the batch pass says of a row at this time, should it come next. At the time of
+        the newest row itself, that row's values are known already. Several times are several
+        questions: none of them changes the answer to another.
+
+        Args:
+            t: when, in the unit of the stream, not before the newest row; or an array of times.
+
+        Returns:
+            (channels,) in original units, or (times, channels).
+
+        Raises:
+            InputError: a time that is no finite number, or lies before the newest row.
+            DivergenceError: the state has left the finite numbers; `reset` the stream.
+        """
+        if isinstance(t, np.ndarray) and t.ndim == 0:
+            t = t[()]
+        several = isinstance(t, list | tuple | np.ndarray)
+        asked = [self._asked(self._clock.read(one)) for one in (t if several else [t])]  # type: ignore[union-attr]
+        if not asked:
+            return np.empty((0, len(self.names)))
+        predicted = self._predict(np.array(asked))
+        return predicted if several else predicted[0]
+
+    def reset(self) -> None:
+        """Begins anew: nothing seen yet. The counters go on."""
+        self._placing.begin_anew()
+
+    def state(self) -> dict[str, Any]:
+        """All that the stream is, as JSON knows it; `restore` goes on from it bit for bit."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "model": self._engine.fingerprint(),
+            "time_unit": self.time_unit,
+            **self._placing.record(),
+        }
+
+    def restore(self, record: dict[str, Any]) -> None:
+        """Takes up what `state` recorded. The policies stay this stream's own.
+
+        Raises:
+            InputError: the record is damaged, or of another model or time unit. Nothing has changed
+                then.
+        """
+        if not isinstance(record, dict) or record.get("format") != FORMAT:
+            raise InputError(f"this is no record of a stream (it has no format {FORMAT!r})")
+        for key, expected, fix in (
+            ("version", VERSION, "use the Offbeat that wrote it, or a newer one"),
+            ("model", self._engine.fingerprint(), "restore it with the model that wrote it"),
+            ("time_unit", self.time_unit, "give this stream the time unit of the record"),
+        ):
+            if record.get(key) != expected:
+                got = record.get(key)
+                raise InputError(f"the record is of {key} {got!r}, not {expected!r}; {fix}")
+        self._placing.restore(record)
+
+    def _predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(times, channels) in original units."""
+        scaled = self._engine.predict(times)
+        if not np.isfinite(scaled).all():
+            raise DivergenceError("the state has left the finite numbers; reset the stream")
+        self._placing.counters.predictions += len(times)
+        return self._frame.scaler.original(scaled)
+
+    def _asked(self, t: Time) -> float:
+        """A time that was asked for, in s."""
+        if not self._history.rows:
+            return 0.0
+        time, newest = self._clock.seconds(t), self._history.newest
+        if newest - time > self.policies.merge_within_s:
+            raise InputError(
+                f"asked for the time {t}, {newest - time:g} s before the newest row, of the time "
+                f"{self.time}; a stream answers for the time of its newest row and later"
+            )
+        return max(time, newest)

@@ -1,0 +1,266 @@
+"""Where a message belongs: beside the rows, among them, aside, or nowhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.errors import InputError
+from offbeat.stream.engine import Engine, decode, encode
+from offbeat.stream.history import History, seconds
+from offbeat.stream.messages import Clock, Time
+from offbeat.stream.options import Outcome, StreamCounters, StreamOptions
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Message:
+    """A message kept aside, its time as it came, its values as a row."""
+
+    t: Time
+    values: NDArray[Any]
+    mask: NDArray[np.bool_]
+
+
+class Placement:
+    """Makes rows in the order of time out of messages in any, by the policies, and counts.
+
+    Args:
+        engine: consumes the rows.
+        policies: what to do with messages out of order.
+        names: of the channels, for messages.
+        time_unit: of all times.
+        median_gap: s, between the rows of the training part.
+        elapsed_limit: s without an observation, at which the model's time saturates.
+
+    Raises:
+        InputError: an unknown unit, or policies that do not go with the model's usual gap.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        policies: StreamOptions,
+        *,
+        names: tuple[str, ...],
+        time_unit: str,
+        median_gap: float,
+        elapsed_limit: float,
+    ) -> None:
+        self._engine, self._policies, self._names = engine, policies, names
+        self.clock, self.history = Clock(time_unit), History(engine, policies.kept_rows)
+        self.counters = StreamCounters()
+        self.held: list[Message] = []
+        self.seen: float | None = None
+        """s, time of the newest row in which anything was measured."""
+        self.before_row: Callable[[float], None] | None = None
+        """Is told the time of each next row, before the engine consumes it."""
+        self._pause = median_gap + policies.merge_within_s
+        """s, that a jump of the clock is taken for."""
+        longest = policies.jump_ahead_s
+        if policies.jump == "continue" and longest is not None and longest <= self._pause:
+            raise InputError(
+                f"jump_ahead_s is {longest!r}, no longer than the model's usual gap of "
+                f"{median_gap:g} s (and merge_within_s): every row would be a jump"
+            )
+        limit = policies.long_gap_s
+        self._long_gap = elapsed_limit if limit is None else limit
+
+    @property
+    def time(self) -> Time | None:
+        """Of the newest row, in the unit of the clock; None before the first."""
+        return self.clock.at(self.history.newest) if self.history.rows else None
+
+    def begin_anew(self) -> None:
+        """Nothing seen yet; the counters go on."""
+        self._engine.reset()
+        self.history.forget()
+        self.clock.origin = None
+        self.held, self.seen = [], None
+        self.counters.resets += 1
+
+    def drop(self, outcome: Outcome) -> Outcome:
+        """Counts a message that is dropped."""
+        setattr(self.counters, outcome, getattr(self.counters, outcome) + 1)
+        return outcome
+
+    def record(self) -> dict[str, Any]:
+        """All of it, as JSON knows it."""
+        return {
+            "origin": self.clock.origin,
+            "seen": self.seen,
+            "history": self.history.record(),
+            "held": [
+                {"t": m.t, "values": encode(m.values), "mask": encode(m.mask)} for m in self.held
+            ],
+            "counters": self.counters.to_dict(),
+        }
+
+    def restore(self, record: dict[str, Any]) -> None:
+        """The inverse of `record`.
+
+        Raises:
+            InputError: the record is damaged. Nothing has changed then.
+        """
+        channels = len(self._names)
+        values, mask = np.zeros(channels, self._engine.dtype), np.zeros(channels, dtype=bool)
+        try:
+            origin = None if record["origin"] is None else self.clock.read(record["origin"])
+            seen = None if record["seen"] is None else seconds(record["seen"])
+            held = [
+                Message(
+                    self.clock.read(m["t"]),
+                    decode(m["values"], values, "values of a held message"),
+                    decode(m["mask"], mask, "mask of a held message"),
+                )
+                for m in record["held"]
+            ]
+            counters = StreamCounters.from_dict(record["counters"])
+            self.history.restore(record["history"], channels)
+        except (KeyError, TypeError) as error:
+            what = f"{type(error).__name__}: {error}"
+            raise InputError(f"the record of the stream is damaged ({what})") from None
+        self.clock.origin, self.seen = origin, seen
+        self.held, self.counters = held, counters
+
+    def take(
+        self, t: Time, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
+    ) -> Outcome:
+        """Puts a message where it belongs: beside the rows, aside, or nowhere."""
+        policies = self._policies
+        if not self.history.rows:
+            self.clock.origin = t
+            return self._append(0.0, values, mask, measured)
+        time = self.clock.seconds(t)
+        ahead = time - self.history.newest
+        if ahead < -policies.jump_back_s or ahead > (policies.jump_ahead_s or math.inf):
+            return self._far(t, ahead, values, mask)
+        if self.held:
+            self._release()
+        if abs(ahead) <= policies.merge_within_s:
+            return self._join(len(self.history.rows) - 1, values, mask)
+        if ahead > 0:
+            return self._append(time, values, mask, measured)
+        return self._late(time, values, mask)
+
+    def _append(
+        self, time: float, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
+    ) -> Outcome:
+        """The next row."""
+        gap = time - self.seen if measured and self.seen is not None else 0.0
+        long = gap > self._long_gap
+        if long and self._policies.long_gap == "reset":
+            origin, floor = self.clock.origin, self.history.newest
+            self.begin_anew()
+            self.clock.origin, self.history.floor = origin, floor
+        if self.before_row is not None:
+            self.before_row(time)
+        self.history.append(time, values, mask)
+        self.counters.rows += 1
+        if measured:
+            self.seen = time
+            self.counters.long_gaps += long
+            self.counters.longest_gap_s = max(self.counters.longest_gap_s, gap)
+        return "new"
+
+    def _join(self, i: int, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
+        """A message of the time of row i."""
+        old = self.history.rows[i]
+        twice = mask & old.mask
+        repeated = bool(twice.any())
+        if repeated and self._policies.duplicates == "error":
+            raise InputError(
+                f"measured twice at the time {self.clock.at(old.time)}: "
+                f"{', '.join(np.array(self._names)[twice])}; choose the policy duplicates='first' "
+                "or 'last' if that may be"
+            )
+        taken = mask if self._policies.duplicates == "last" else mask & ~old.mask
+        joined, union = np.where(taken, values, old.values), old.mask | taken
+        changed = not (np.array_equal(joined, old.values) and np.array_equal(union, old.mask))
+        if changed:
+            self.history.replace(i, joined, union)
+            self.seen = max(old.time if self.seen is None else self.seen, old.time)
+        self.counters.duplicates += repeated
+        self.counters.merged += changed
+        return "merged" if changed else "duplicate"
+
+    def _late(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
+        """A message older than the newest row."""
+        policies, behind = self._policies, self.history.newest - time
+        if behind > (policies.stale_after_s or math.inf):
+            return self.drop("stale")
+        if policies.late == "error":
+            raise InputError(
+                f"a message is {behind:g} s older than the newest row, of the time {self.time}; "
+                "choose the policy late='drop' or 'reorder' if that may be"
+            )
+        place = self.history.place(time, policies.merge_within_s)
+        if policies.late == "drop" or place is None:
+            return self.drop("late")
+        i, joins = place
+        if joins:
+            return self._join(i, values, mask)
+        self.history.insert(i, time, values, mask)
+        if mask.any():
+            self.seen = time if self.seen is None else max(self.seen, time)
+        self.counters.rows += 1
+        self.counters.reordered += 1
+        return "reordered"
+
+    # --- clocks that jump -------------------------------------------------------------------------
+
+    def _far(self, t: Time, ahead: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
+        """A message so far off that the clock may have jumped."""
+        policies = self._policies
+        if policies.jump == "error":
+            newer = "newer" if ahead > 0 else "older"
+            raise InputError(
+                f"a message is {abs(ahead):g} s {newer} than the newest row, of the time "
+                f"{self.time}; choose another policy of jump if that may be"
+            )
+        if policies.jump == "drop":
+            if ahead > 0:
+                return self.drop("ahead")
+            return self._late(self.clock.seconds(t), values, mask)
+        if self.held:
+            step = self.clock.between(t, self.held[-1].t)
+            if not -policies.jump_back_s <= step <= (policies.jump_ahead_s or math.inf):
+                self._release()
+        self.held.append(Message(t, values, mask))
+        if len(self.held) < policies.confirm:
+            return "held"
+        held, self.held = sorted(self.held, key=lambda message: message.t), []
+        self.counters.jumps_ahead += ahead > 0
+        self.counters.jumps_back += ahead < 0
+        if policies.jump == "reset":
+            self.begin_anew()
+        else:
+            self.clock.rebase(held[0].t, self.history.newest + self._pause)
+        for message in held:
+            self._take_held(message)
+        return "jumped"
+
+    def _take_held(self, message: Message) -> None:
+        """Consumes what was held; what a policy calls an error is dropped: it came long ago."""
+        try:
+            measured = int(np.count_nonzero(message.mask))
+            self.take(message.t, message.values, message.mask, measured)
+        except InputError:
+            self.drop("late")
+
+    def _release(self) -> None:
+        """The clock has not jumped: held messages are late ones, or too far ahead."""
+        held, self.held = self.held, []
+        for message in held:
+            time = self.clock.seconds(message.t)
+            if time > self.history.newest:
+                self.drop("ahead")
+                continue
+            try:
+                self._late(time, message.values, message.mask)
+            except InputError:
+                self.drop("late")

@@ -1,0 +1,154 @@
+"""Runs a model row by row through its own forward pass: a stream is a batch of one row."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from offbeat.data.batch import Batch
+from offbeat.models.elapsed import RecurrentState
+from offbeat.models.model import Model
+from offbeat.stream.engine import Arrays, Engine
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A carry, and where its generator of generator stands; the generator itself moves on."""
+
+    carry: RecurrentState
+    generator: Tensor | None
+
+
+class TorchEngine(Engine):
+    """The reference: `model(row, carry=...)`.
+
+    Args:
+        model: its weights are used as they are when a row comes.
+        seed: of the generator of self-feeding.
+    """
+
+    def __init__(self, model: Model, *, seed: int = 0) -> None:
+        self._model, self._seed = model, seed
+        self._valid = torch.ones((1, 1), dtype=torch.bool)
+        self._slots: list[_State | None] = []
+        self.reset()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the model's weights."""
+        return np.dtype(str(self._model.dtype).removeprefix("torch."))
+
+    def reserve(self, slots: int) -> None:
+        """Makes room for references: a carry is never changed, only followed by another."""
+        self._slots = [None] * slots
+
+    def reset(self) -> None:
+        """Begins anew, with the first coin."""
+        feeding = bool(self._model.config.self_feeding)
+        generator = torch.Generator().manual_seed(self._seed) if feeding else None
+        with torch.inference_mode():
+            self._carry = self._model.empty_state(1, generator=generator)
+
+    def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
+        """Consumes one row."""
+        before = self._state()
+        seen = torch.tensor(mask)[None, None]
+        row = Batch(
+            torch.tensor([[time]], dtype=torch.float64),
+            torch.tensor(values, dtype=self._model.dtype)[None, None],
+            seen,
+            seen,
+            self._valid,
+        )
+        try:
+            with torch.inference_mode():
+                self._carry = self._model(row, carry=self._carry).carry
+        except Exception:
+            self._take(before)
+            raise
+
+    def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Each time a trajectory of its own, all with this carry."""
+        count, channels = len(times), self._model.channels
+        hidden = torch.zeros((count, 1, channels), dtype=torch.bool)
+        asked = Batch(
+            torch.tensor(times)[:, None],
+            torch.zeros((count, 1, channels), dtype=self._model.dtype),
+            hidden,
+            hidden,
+            self._valid.expand(count, 1),
+        )
+        carried = {
+            name: part.expand(count, *part.shape[1:])
+            for name, part in _tensors(self._carry).items()
+        }
+        carry = replace(self._carry, **carried)  # type: ignore[arg-type]
+        if carry.generator is not None:  # a coin acts after the prediction is read
+            carry = replace(carry, generator=torch.Generator())
+        with torch.inference_mode():
+            predicted: Tensor = self._model(asked, carry=carry).predictions
+            return predicted[:, 0].double().numpy()
+
+    def save(self, slot: int) -> None:
+        """Keeps a reference to the carry."""
+        self._slots[slot] = self._state()
+
+    def load(self, slot: int) -> None:
+        """Goes back to a carry that was kept."""
+        kept = self._slots[slot]
+        if kept is None:
+            raise ValueError(f"nothing was saved in slot {slot}")
+        self._take(kept)
+
+    def export(self) -> Arrays:
+        """The parts of the carry, by their names; `rows`; and `generator`, where there are any."""
+        state = self._state()
+        arrays = {name: part.numpy().copy() for name, part in _tensors(state.carry).items()}
+        arrays["rows"] = np.array(state.carry.rows, dtype=np.int64)
+        if state.generator is not None:
+            arrays["generator"] = state.generator.numpy().copy()
+        return arrays
+
+    def restore(self, arrays: Arrays) -> None:
+        """Takes the parts of a carry."""
+        parts: dict[str, Any] = {name: torch.tensor(arrays[name]) for name in _tensors(self._carry)}
+        carry = replace(self._carry, rows=int(arrays["rows"]), **parts)
+        generator = torch.tensor(arrays["generator"]) if "generator" in arrays else None
+        self._take(_State(carry, generator))
+
+    def fingerprint(self) -> str:
+        """Of config, statistics, scaler, channels and weights."""
+        model = self._model
+        facts = {
+            "model": asdict(model.config),
+            "statistics": model.statistics.to_dict(),
+            "scaler": model.scaler.to_dict(),
+            "names": model.names,
+            "units": model.units,
+            "dtype": str(model.dtype),
+        }
+        digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+        for name, weight in sorted(model.state_dict().items()):
+            digest.update(name.encode() + weight.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def _state(self) -> _State:
+        generator = self._carry.generator
+        return _State(self._carry, None if generator is None else generator.get_state())
+
+    def _take(self, state: _State) -> None:
+        self._carry = state.carry
+        if state.generator is not None and state.carry.generator is not None:
+            state.carry.generator.set_state(state.generator)
+
+
+def _tensors(carry: RecurrentState) -> dict[str, Tensor]:
+    parts = {field.name: getattr(carry, field.name) for field in fields(carry)}
+    return {name: part for name, part in parts.items() if isinstance(part, Tensor)}

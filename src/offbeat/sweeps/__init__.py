@@ -1,0 +1,1 @@
+"""Sweeps: many models over repeats that share windows, masks and splits."""

@@ -1,0 +1,118 @@
+"""Processes of this machine, which live as long as the experiment and keep its data in memory."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from offbeat.data.simulate import available_cores
+from offbeat.sweeps.engines.base import Ending, Engine, attempt
+from offbeat.sweeps.side_by_side import end_with_parent
+from thesis.execute import Task
+
+_GIB_PER_PROCESS = 2.0  # data of the full protocol, its parts, torch: 1.7 at the peak
+
+
+class LocalEngine(Engine):
+    """Long-lived processes with a few threads each.
+
+    Args:
+        processes: how many; by default as many as cores and memory allow.
+        threads: of each.
+    """
+
+    def __init__(self, processes: int | None, threads: int) -> None:
+        self.capacity = processes or max(1, min(available_cores() // threads, _room()))
+        self.description = (
+            f"{self.capacity} process{'es' * (self.capacity > 1)} of {threads} "
+            f"thread{'s' * (threads > 1)}"
+        )
+        # A fork after torch has computed can hang.
+        self._context = multiprocessing.get_context("spawn")
+        self._workers: list[_Worker] = []
+
+    def submit(self, task: Task) -> None:
+        """Gives the task to an idle process; starts one if there is none."""
+        for worker in self._workers:
+            if worker.task is None:
+                break
+        else:
+            ours, theirs = self._context.Pipe()
+            process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
+            process.start()
+            theirs.close()
+            worker = _Worker(process, ours)
+            self._workers.append(worker)
+        worker.task = task
+        with suppress(OSError):  # it has died while idle; `wait` finds the task lost
+            worker.pipe.send(task)
+
+    def wait(self, seconds: float) -> list[Ending]:
+        """Waits until a process is done with its task or has died."""
+        busy = [(worker, worker.task) for worker in self._workers if worker.task is not None]
+        if not busy:
+            return []
+        signs = [sign for worker, _ in busy for sign in (worker.pipe, worker.process.sentinel)]
+        connection.wait(signs, timeout=seconds)
+        endings = []
+        for worker, task in busy:
+            try:
+                if worker.pipe.poll():
+                    endings.append(Ending(task, worker.pipe.recv()))
+                    worker.task = None
+                    continue
+            except (EOFError, OSError):
+                worker.process.join()
+            if worker.process.exitcode is not None:
+                endings.append(Ending(task, lost=True))
+                self._workers.remove(worker)
+                worker.pipe.close()
+        return endings
+
+    def stop(self) -> None:
+        """Ends all processes: idle ones by closing their pipe, others by force."""
+        for worker in self._workers:
+            worker.pipe.close()
+            if worker.task is not None:
+                worker.process.kill()
+        for worker in self._workers:
+            worker.process.join()
+        self._workers.clear()
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: Any
+    pipe: Any
+    task: Task | None = None
+
+
+def _serve(pipe: Any) -> None:
+    """A process that does one task after another, and ends with the process that started it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
+    tqdm.set_lock(threading.RLock())  # by default a semaphore, which a killed process leaves behind
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    while True:
+        try:
+            task = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(attempt(task))
+
+
+def _room() -> int:
+    """Processes that memory has room for."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        kib = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration, ValueError):
+        return available_cores()
+    return max(1, int(kib / 2**20 / _GIB_PER_PROCESS))

@@ -1,0 +1,90 @@
+"""Slurm, through submitit; where there is no Slurm, submitit's jobs of this machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from offbeat.data.simulate import available_cores
+from offbeat.errors import InputError, require
+from offbeat.sweeps.engines.base import Ending, Engine, attempt
+from thesis.execute import Task
+
+_AT_A_TIME = 100  # below the number of jobs that clusters allow one user
+
+
+class SlurmEngine(Engine):
+    """A job per run. A job that is preempted or out of time is queued again, and goes on.
+
+    Args:
+        processes: jobs at a time, waiting ones too; by default 100 under Slurm, and on this machine
+            one per core.
+        threads: of each run.
+        options: of submitit's `update_parameters`, such as `slurm_partition` and `timeout_min`.
+        folder: for job files and their logs, seen by all nodes.
+    """
+
+    def __init__(
+        self, processes: int | None, threads: int, options: Mapping[str, Any], folder: Path
+    ) -> None:
+        submitit: Any = require("submitit", "cluster")
+        self._executor = submitit.AutoExecutor(folder=folder)
+        here = self._executor.cluster == "local"
+        usual = {"timeout_min": 240, "cpus_per_task": threads, "name": "offbeat"}
+        try:
+            self._executor.update_parameters(**{**usual, **options})
+        except (NameError, TypeError, ValueError) as error:
+            raise InputError(f"submitit does not take these engine_options: {error}") from None
+        self.capacity = processes or (max(1, available_cores() // threads) if here else _AT_A_TIME)
+        what = "submitit on this machine (no Slurm found)" if here else "Slurm through submitit"
+        self.description = f"{what}, {self.capacity} jobs at a time"
+        self._jobs: list[tuple[Any, Task]] = []
+
+    def submit(self, task: Task) -> None:
+        """Queues a job."""
+        self._jobs.append((self._executor.submit(_Job(), task), task))
+
+    def wait(self, seconds: float) -> list[Ending]:
+        """Asks after the jobs until one has ended."""
+        end = time.monotonic() + seconds
+        while True:
+            ended = [(job, task) for job, task in self._jobs if job.done()]
+            if ended or time.monotonic() >= end:
+                break
+            time.sleep(min(0.2, max(0.0, end - time.monotonic())))
+        self._jobs = [pair for pair in self._jobs if pair not in ended]
+        return [_ending(job, task) for job, task in ended]
+
+    def stop(self) -> None:
+        """Cancels all jobs."""
+        for job, _ in self._jobs:
+            with suppress(Exception):  # it may have ended in between
+                job.cancel()
+        self._jobs.clear()
+
+
+class _Job:
+    """What a job runs. submitit asks `checkpoint` before a job is taken away."""
+
+    def __call__(self, task: Task) -> Any:
+        return attempt(task)
+
+    def checkpoint(self, task: Task) -> Any:
+        """The same again: the run's own checkpoints hold how far it has come."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, task)
+
+
+def _ending(job: Any, task: Task) -> Ending:
+    from submitit.core.utils import FailedJobError, UncompletedJobError
+
+    try:
+        return Ending(task, job.result())
+    except FailedJobError:
+        raise  # `attempt` lets nothing through: the node can't run Offbeat
+    except UncompletedJobError:
+        return Ending(task, lost=True)

@@ -1,0 +1,1 @@
+"""The thesis' protocol: its runs, their record, its tables, figures and findings."""

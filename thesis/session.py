@@ -1,0 +1,210 @@
+"""A sitting of an experiment: tasks go to an engine, finished runs into the record."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from offbeat.errors import DivergenceError, OffbeatError
+from offbeat.files import write_json
+from offbeat.sweeps.engines.base import Engine
+from thesis.execute import Task
+from thesis.progress import Progress, duration, seconds_left
+from thesis.protocol import Run
+from thesis.provenance import cpu
+from thesis.record import Record, Row, group_of, group_text
+
+_ATTEMPTS = 3
+
+
+def curve_of(task: Task) -> tuple[Row, ...]:
+    """The lines of the table of curves that a run adds."""
+    return tuple({"run_id": task.run.run_id, **row} for row in task.log())
+
+
+class Session:
+    """One sitting: gives tasks to an engine and writes the record run by run.
+
+    Args:
+        out: folder of the record.
+        engine: runs the tasks.
+        shown: says how far it is.
+        record: what is done already.
+        order: names of all runs, in the order of the record.
+        here: group of the runs that this process would make.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        engine: Engine,
+        shown: Progress,
+        record: Record,
+        order: tuple[str, ...],
+        here: tuple[str, ...],
+    ) -> None:
+        self.out, self.engine, self.shown, self.record = out, engine, shown, record
+        self.order, self.here = order, here
+        self.asked: tuple[Run, ...] = ()
+        self.deadline: float | None = None
+        self.running: dict[str, Task] = {}
+        self.waiting: deque[Task] = deque()
+        self.attempts: dict[str, int] = {}
+        self.diverged: list[str] = []
+        self.groups = {*record.groups(), here}
+        self.sitting = _Sitting(out / "sittings.json", engine.description)
+
+    def run(
+        self, tasks: Iterable[Task], *, asked: Iterable[Run], deadline: float | None = None
+    ) -> Record:
+        """Does the tasks; returns the record with all of them that succeeded.
+
+        Args:
+            tasks: in the order in which to begin them.
+            asked: runs that the user asked for, finished ones too.
+            deadline: on the monotonic clock, s; stop then, in the middle of runs.
+
+        Raises:
+            DivergenceError: a training left the finite numbers; all others were done.
+            OffbeatError: a run failed otherwise, or lost its process three times.
+        """
+        self.waiting.extend(tasks)
+        self.asked, self.deadline = tuple(asked), deadline
+        try:
+            while (self.waiting or self.running) and not self._over():
+                while self.waiting and len(self.running) < self.engine.capacity:
+                    task = self.waiting.popleft()
+                    self.running[task.run.run_id] = task
+                    self.engine.submit(task)
+                for ending in self.engine.wait(self._patience()):
+                    del self.running[ending.task.run.run_id]
+                    if ending.lost:
+                        self._again(ending.task)
+                    elif ending.failure is None:
+                        self._finished(ending.task)
+                    elif ending.failure.diverged:
+                        self.diverged.append(ending.failure.message)
+                        self.shown.say(ending.failure.message)
+                    else:
+                        raise OffbeatError(
+                            f"{ending.failure.message}; what is done is kept, the same command "
+                            "goes on once this is mended"
+                        )
+                self._show()
+            if self.running:
+                names = ", ".join(self.running)
+                self.shown.say(f"the time is over; these go on next time: {names}")
+        finally:
+            self.engine.stop()
+            self.running.clear()
+            self._show(now=True)
+            self.shown.close()
+        if self.diverged:
+            raise DivergenceError(
+                f"{len(self.diverged)} of the runs diverged, all others that were asked for are "
+                f"done; the first: {self.diverged[0]}"
+            )
+        return self.record
+
+    def _over(self) -> bool:
+        return self.deadline is not None and time.monotonic() >= self.deadline
+
+    def _patience(self) -> float:
+        left = 1.0 if self.deadline is None else self.deadline - time.monotonic()
+        return min(1.0, max(0.0, left))
+
+    def _again(self, task: Task) -> None:
+        name = task.run.run_id
+        self.attempts[name] = self.attempts.get(name, 0) + 1
+        if self.attempts[name] >= _ATTEMPTS:
+            raise OffbeatError(
+                f"the process that did {name} was ended {_ATTEMPTS} times, for want of memory "
+                "perhaps; what is done is kept: run the same command with fewer processes"
+            )
+        self.shown.say(f"the process that did {name} was ended; it goes on in another one")
+        self.waiting.appendleft(task)
+
+    def _finished(self, task: Task) -> None:
+        row = task.result()
+        if row is None:
+            raise OffbeatError(
+                f"{task.folder} has no result although the run has ended; the workers must see "
+                "the same folder as this process"
+            )
+        self.record = self.record.with_run(row, curve_of(task)).in_order(self.order)
+        self.record.write(self.out)
+        self.sitting.update(row["run_id"])
+        group = group_of(row)
+        if group not in self.groups:
+            self.groups.add(group)
+            self.shown.say(
+                f"warning: {task.run.run_id} was made differently from this process: "
+                f"{group_text(group, self.here)}; the record marks it"
+            )
+        rmse = {name: row[f"{name}_mse"] ** 0.5 for name in ("published", "honest")}
+        self.shown.say(
+            f"[{self._done()}/{len(self.asked)}] {task.run.run_id}: published RMSE "
+            f"{rmse['published']:.4f}, honest {rmse['honest']:.4f}, "
+            f"{duration(row['seconds'])}; left: {duration(self._left())}"
+        )
+
+    def _done(self) -> int:
+        return sum(run.run_id in self.record.runs for run in self.asked)
+
+    def _left(self) -> float | None:
+        mine = [row for row in self.record.runs.values() if group_of(row) == self.here]
+        waiting = [task.run for task in self.waiting]
+        return seconds_left(waiting, self._epochs(), mine, capacity=self.engine.capacity)
+
+    def _epochs(self) -> dict[Run, int]:
+        return {task.run: len(task.log()) for task in self.running.values()}
+
+    def _show(self, *, now: bool = False) -> None:
+        if not (now or self.shown.due()):
+            return
+        self.sitting.update()
+        self.shown.update(
+            done=self._done(),
+            total=len(self.asked),
+            left=self._left(),
+            running=self._epochs(),
+            facts={"engine": self.engine.description, "diverged": self.diverged},
+        )
+
+
+class _Sitting:
+    """What a call did, and how long it lasted: the last line of `sittings.json`.
+
+    It is written again and again, so that a call that is killed is counted up to its end.
+    """
+
+    def __init__(self, path: Path, engine: str) -> None:
+        self.path = path
+        self.before = read_sittings(path)
+        self.began = time.monotonic()
+        self.line: dict[str, Any] = {
+            "began_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "seconds": 0.0,
+            "engine": engine,
+            "cpu": cpu(),
+            "runs": [],
+        }
+
+    def update(self, run_id: str | None = None) -> None:
+        if run_id:
+            self.line["runs"].append(run_id)
+        self.line["seconds"] = round(time.monotonic() - self.began, 1)
+        write_json(self.path, [*self.before, self.line])
+
+
+def read_sittings(path: Path) -> list[dict[str, Any]]:
+    """When the calls that made a record began, how long they lasted, what they did."""
+    try:
+        return list(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return []
