@@ -15,6 +15,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "offbeat"
 # replaced without the stages that come after it.
 STAGES = (
     "errors",
+    "registry",
     "files",
     "config",
     "data",

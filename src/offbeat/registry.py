@@ -1,0 +1,102 @@
+"""Registries: one form for models, parts, backends, readers, writers, robots and baselines."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Iterator, Mapping
+from typing import Generic, TypeVar
+
+from offbeat.errors import InputError, one_of
+
+T = TypeVar("T")
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Entries by name. Names are listed in the order in which they were registered.
+
+    Packages add entries by calling `register`, or by an entry point of `group`, which is loaded
+    when a name is looked up that is not there, or when all names are asked for. An entry point is
+    a function without arguments that registers, or that returns the entry.
+
+    Args:
+        what: what an entry is, for messages: `cell`, `reader`.
+        group: of entry points, such as `offbeat.models`; None for a registry without.
+
+    Example:
+        >>> CELLS: Registry[type] = Registry("cell")
+        >>> CELLS.register("identity", object)
+        <class 'object'>
+    """
+
+    def __init__(self, what: str, *, group: str | None = None) -> None:
+        self.what, self.group = what, group
+        self._entries: dict[str, T] = {}
+        self._loaded = group is None
+
+    def register(self, name: str, entry: T, *, replace: bool = False) -> T:
+        """Adds an entry; returns it.
+
+        Args:
+            name: what users say.
+            entry: what they get.
+            replace: allow a name that is taken.
+
+        Raises:
+            InputError: the name is empty or taken.
+        """
+        if not name or not isinstance(name, str):
+            raise InputError(f"a {self.what} needs a name, got {name!r}")
+        if name in self._entries and not replace:
+            raise InputError(
+                f"there is a {self.what} {name!r} already; choose another name, or pass "
+                "replace=True"
+            )
+        self._entries[name] = entry
+        return entry
+
+    def unregister(self, name: str) -> None:
+        """Removes an entry, for tests and notebooks that define one again."""
+        self._entries.pop(name, None)
+
+    def __getitem__(self, name: str) -> T:
+        """The entry of a name.
+
+        Raises:
+            InputError: there is none; the message lists the names and the nearest one.
+        """
+        if name not in self._entries:
+            self._load()
+            one_of(self.what, name, self._entries)
+        return self._entries[name]
+
+    def __contains__(self, name: object) -> bool:
+        if name not in self._entries:
+            self._load()
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        self._load()
+        return iter(tuple(self._entries))
+
+    def __len__(self) -> int:
+        self._load()
+        return len(self._entries)
+
+    def _load(self) -> None:
+        """Loads the entry points of other packages, once."""
+        if self._loaded or self.group is None:
+            return
+        self._loaded = True
+        for point in importlib.metadata.entry_points(group=self.group):
+            if point.name in self._entries:
+                continue
+            try:
+                entry = point.load()
+                made = entry() if callable(entry) and not isinstance(entry, type) else entry
+            except Exception as error:  # another package's code
+                raise InputError(
+                    f"the {self.what} {point.name!r} of the entry point {point.value!r} cannot be "
+                    f"loaded ({type(error).__name__}: {error}); update or remove that package"
+                ) from error
+            if made is not None and point.name not in self._entries:
+                self._entries[point.name] = made
