@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Generic, TypeVar
 
@@ -93,10 +94,12 @@ class Registry(Mapping[str, T], Generic[T]):
             try:
                 entry = point.load()
                 made = entry() if callable(entry) and not isinstance(entry, type) else entry
-            except Exception as error:  # another package's code
-                raise InputError(
-                    f"the {self.what} {point.name!r} of the entry point {point.value!r} cannot be "
-                    f"loaded ({type(error).__name__}: {error}); update or remove that package"
-                ) from error
+            except Exception as error:  # another package's code must not stop this one
+                warnings.warn(
+                    f"the {self.what} {point.name!r} ({point.value}) of another package cannot be "
+                    f"loaded: {type(error).__name__}: {error}",
+                    stacklevel=3,
+                )
+                continue
             if made is not None and point.name not in self._entries:
                 self._entries[point.name] = made
