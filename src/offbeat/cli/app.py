@@ -85,8 +85,10 @@ def run_commands(
         prog: the program's name.
         description: for its help.
     """
-    from jsonargparse import ArgumentError, auto_cli
+    from jsonargparse import ArgumentError, auto_cli, set_parsing_settings
 
+    # No value, from a file or typed, may name a class or a function that is then called.
+    set_parsing_settings(instantiate_subclass_spec_in_any=False, import_path_denylist=["*"])
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     # Flags, although options made from bool arguments want a value.
     arguments = [f"{argument}=true" if argument in FLAGS else argument for argument in arguments]
