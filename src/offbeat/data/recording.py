@@ -22,6 +22,7 @@ from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
 from offbeat.data.signals import Recording as Recording
 from offbeat.data.signals import Signal as Signal
 from offbeat.data.trajectory import Dataset
+from offbeat.data.transforms import lowest_of
 from offbeat.errors import FileFormatError
 
 DEFAULT = ReaderOptions()
@@ -75,9 +76,11 @@ def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT)
             f"(min_rows {policies.min_rows}); check the file, or give a smaller min_rows"
         )
     _mask_held(episodes, channels, policies, account)
-    if policies.unwrap or policies.quaternions == "continuous":
+    if policies.unwrap:
+        _unwrap(episodes, channels, account)
+    if policies.quaternions == "continuous":
         for episode in episodes:
-            _mend(episode, channels, policies, account)
+            _mend(episode, channels, account)
     if policies.resample_hz is not None:
         for episode in episodes:
             _resample(episode, policies.resample_hz)
@@ -110,14 +113,19 @@ def _mask_held(
                 account.masked += int(repeats.sum())
 
 
-def _mend(
-    episode: Episode, channels: Channels, policies: ReaderOptions, account: CleaningLog
-) -> None:
-    if policies.unwrap:
-        for c, period in channels.angles.items():
-            turns = repairs.unwrap(episode.own()[:, c], period)
-            if turns:
-                account.turns[channels.names[c]] += turns
+def _unwrap(episodes: list[Episode], channels: Channels, account: CleaningLog) -> None:
+    for c, period in channels.angles.items():
+        name = channels.names[c]
+        low = np.fmin.reduce([np.fmin.reduce(episode.values[:, c]) for episode in episodes])
+        high = np.fmax.reduce([np.fmax.reduce(episode.values[:, c]) for episode in episodes])
+        turns = sum(repairs.unwrap(episode.own()[:, c], period) for episode in episodes)
+        if turns:
+            account.turns[name] += turns
+        lowest = lowest_of(float(low), float(high), period) if turns else None
+        account.angles[name] = {"period": period, "lowest": lowest}
+
+
+def _mend(episode: Episode, channels: Channels, account: CleaningLog) -> None:
     for four in channels.quaternions:
         part = episode.own()[:, list(four)]
         mended = repairs.mend_quaternion(part)

@@ -131,6 +131,7 @@ class CleaningLog:
         held: rows per value and share of repeats of each held channel.
         masked: repeated cells that no longer count as measured.
         turns: jumps by a turn taken out of each angle.
+        angles: of each channel that was unwrapped, its period and the range it was recorded in.
         quaternions: channels of each quaternion.
         flipped: rows of quaternions whose sign was turned.
         renormalised: rows of quaternions whose length was off 1 by more than 0.001.
@@ -149,6 +150,7 @@ class CleaningLog:
     held: dict[str, dict[str, float]] = field(default_factory=dict)
     masked: int = 0
     turns: Counter[str] = field(default_factory=Counter)
+    angles: dict[str, dict[str, float | None]] = field(default_factory=dict)
     quaternions: list[list[str]] = field(default_factory=list)
     flipped: int = 0
     renormalised: int = 0
@@ -186,7 +188,11 @@ class CleaningLog:
             },
             "infinite": {"policy": p.infinite, "cells": self.infinite},
             "held": {"policy": p.held, "channels": self.held, "masked": self.masked},
-            "angles": {"unwrap": p.unwrap, "turns": dict(self.turns)},
+            "angles": {
+                "unwrap": p.unwrap,
+                "turns": dict(self.turns),
+                "channels": self.angles,
+            },
             "quaternions": {
                 "policy": p.quaternions,
                 "channels": self.quaternions,

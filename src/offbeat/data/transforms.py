@@ -1,0 +1,424 @@
+"""Input transforms: angles without wraps, quaternions without sign flips, for batches and streams.
+
+A model is trained on angles that have been unwrapped and on quaternions that are continuous in
+sign. `Transforms` records which channels these are; it is saved with the model, applied to
+everything the model is given, and undone on what it predicts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.errors import InputError
+
+Values = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+META_KEY = "transforms"
+"""Key of `Dataset.meta` that lists the transforms a data set has been through."""
+
+_DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
+_UNIT_LENGTH = 1e-12  # a quaternion that is nearer to length 1 than this is not divided again
+_NO_LENGTH = 1e-6  # a quaternion that is shorter than this has no direction
+
+
+def full_turn(unit: str) -> float:
+    """A full turn in the unit of an angle channel: 360 for degrees, else 2 pi."""
+    return 360.0 if unit.casefold() in _DEGREES else 2 * math.pi
+
+
+def lowest_of(low: float, high: float, period: float) -> float | None:
+    """The lower end of the range that a wrapping angle is recorded in.
+
+    Args:
+        low: the lowest value recorded.
+        high: the highest value recorded.
+        period: a full turn.
+
+    Returns:
+        `-period / 2` or 0 where all values lie within one turn from there; None where they lie in
+        neither range.
+    """
+    for lowest in (-period / 2, 0.0):
+        if _inside(low, lowest, period) and _inside(high, lowest, period):
+            return lowest
+    return None
+
+
+@dataclass(frozen=True)
+class Angle:
+    """A channel that is an angle.
+
+    Attributes:
+        period: a full turn, in the unit of the channel.
+        lowest: lower end of the range that its sensor wraps to, in the unit of the channel; None
+            where the recorded data never wrapped.
+    """
+
+    period: float
+    lowest: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.period) and self.period > 0):
+            raise InputError(
+                f"the period of an angle must be finite and above 0, got {self.period!r}"
+            )
+        if self.lowest is not None and not math.isfinite(self.lowest):
+            raise InputError(f"the lowest value of an angle must be finite, got {self.lowest!r}")
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """What is done to the channels of a data set before a model sees them.
+
+    Each angle is unwrapped: a step of more than half a turn between two observations is taken for
+    a wrap. Each quaternion is scaled to length 1, with the sign nearer to the observation before.
+    Only what was observed earlier decides, so a stream and a batch agree.
+
+    Attributes:
+        angles: the angle channels, by name.
+        quaternions: four channel names per quaternion.
+
+    Raises:
+        InputError: a quaternion does not have four channels, or a channel is named twice.
+    """
+
+    angles: Mapping[str, Angle] = field(default_factory=dict)
+    quaternions: tuple[tuple[str, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "angles", dict(self.angles))
+        fours = tuple(tuple(four) for four in self.quaternions)
+        object.__setattr__(self, "quaternions", fours)
+        for four in fours:
+            if len(four) != 4:
+                raise InputError(f"a quaternion has four channels, got {list(four)}")
+        names = [*self.angles, *(name for four in fours for name in four)]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"the channel {twice!r} is named twice in the transforms")
+
+    @classmethod
+    def identity(cls) -> Transforms:
+        """Changes nothing."""
+        return cls()
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> Transforms:
+        """The transforms that a data set has been through: those of `apply`, or of its reader."""
+        if META_KEY in dataset.meta:
+            found = cls.from_dict(dataset.meta[META_KEY])
+        else:
+            log = dataset.meta.get("cleaning", dataset.meta.get("report", {}))
+            turns, fours = log.get("angles", {}), log.get("quaternions", {})
+            units = dict(zip(dataset.names, dataset.units, strict=True))
+            angles = {  # data sets of 0.1.0 name the angles that jumped, without their period
+                name: {"period": full_turn(units[name])}
+                for name in turns.get("turns", {})
+                if name in units
+            } | turns.get("channels", {})
+            found = cls.from_dict({"angles": angles, "quaternions": fours.get("channels", [])})
+        return found.restricted(dataset.names)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether there is nothing to do."""
+        return not self.angles and not self.quaternions
+
+    def restricted(self, names: Sequence[str]) -> Transforms:
+        """The transforms of these channels alone."""
+        return Transforms(
+            {name: angle for name, angle in self.angles.items() if name in names},
+            tuple(four for four in self.quaternions if set(four) <= set(names)),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form."""
+        return {
+            "angles": {
+                name: {"period": angle.period, "lowest": angle.lowest}
+                for name, angle in self.angles.items()
+            },
+            "quaternions": [list(four) for four in self.quaternions],
+        }
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> Transforms:
+        """The inverse of `to_dict`.
+
+        Raises:
+            InputError: the record is damaged.
+        """
+        try:
+            angles = {str(name): Angle(**angle) for name, angle in value["angles"].items()}
+            return cls(angles, tuple(tuple(map(str, four)) for four in value["quaternions"]))
+        except (AttributeError, KeyError, TypeError) as error:
+            raise InputError(
+                f"the transforms are damaged ({type(error).__name__}: {error})"
+            ) from None
+
+    def apply(self, dataset: Dataset) -> Dataset:
+        """Transforms a data set; what it has been through already is not done again.
+
+        Values that are known and not observed follow the observations around them, and change
+        nothing else.
+
+        Args:
+            dataset: with any of the channels, in original units.
+
+        Returns:
+            The data set, with the transforms listed in its `meta`; the same object where nothing
+            is to be done.
+        """
+        done = Transforms.of(dataset)
+        todo = self._without(done).restricted(dataset.names)
+        if todo.is_identity:
+            return dataset
+        both = Transforms({**done.angles, **todo.angles}, (*done.quaternions, *todo.quaternions))
+        return replace(
+            dataset,
+            trajectories=tuple(_transformed(t, todo) for t in dataset),
+            meta={**dataset.meta, META_KEY: both.to_dict()},
+        )
+
+    def undo(self, predicted: Dataset, given: Dataset) -> Dataset:
+        """Takes predictions back to the convention of the data that they were made from.
+
+        Angles come back with the turns of the last observation before them, and within the range
+        of the sensor as long as all observations before them were. Quaternions come back with
+        length 1.
+
+        Args:
+            predicted: one trajectory of predictions per trajectory given.
+            given: what was observed, as it was before `apply`.
+        """
+        if self.is_identity:
+            return predicted
+        todo = self._without(Transforms.of(given)).restricted(given.names)
+        results = []
+        for answer, trajectory in zip(predicted, given, strict=True):
+            values = answer.values.copy()
+            for name, angle in todo.angles.items():
+                at = answer.names.index(name)
+                values[:, at] = _wrapped_back(values[:, at], answer.times, trajectory, name, angle)
+            for four in self.quaternions:
+                columns = [answer.names.index(name) for name in four]
+                values[:, columns] = _unit(values[:, columns])
+            results.append(replace(answer, values=values))
+        return replace(predicted, trajectories=tuple(results))
+
+    def _without(self, done: Transforms) -> Transforms:
+        return Transforms(
+            {name: angle for name, angle in self.angles.items() if name not in done.angles},
+            tuple(four for four in self.quaternions if four not in done.quaternions),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TransformState:
+    """What a stream must remember to transform its next row.
+
+    Attributes:
+        angle: (angles,) the last observation of each angle as it was sent; NaN before the first.
+        turns: (angles,) turns taken out of it.
+        in_range: (angles,) whether all observations so far lay in the range of the sensor.
+        quaternion: (quaternions, 4) the last observation, of length 1; NaN before the first.
+        sign: (quaternions,) 1 or -1, applied to it.
+    """
+
+    angle: Values
+    turns: Values
+    in_range: Mask
+    quaternion: Values
+    sign: Values
+
+
+class LiveTransforms:
+    """`Transforms` for one row after the other; the state is given and returned.
+
+    Args:
+        transforms: of the model.
+        names: channels of a row, in order.
+    """
+
+    def __init__(self, transforms: Transforms, names: Sequence[str]) -> None:
+        angles = transforms.restricted(names).angles
+        fours = transforms.restricted(names).quaternions
+        self._angles = np.array([names.index(name) for name in angles], dtype=np.int64)
+        self._periods = np.array([angle.period for angle in angles.values()])
+        self._lowest = np.array(
+            [np.nan if angle.lowest is None else angle.lowest for angle in angles.values()]
+        )
+        self._fours = [[names.index(name) for name in four] for four in fours]
+
+    def start(self) -> TransformState:
+        """Nothing observed yet."""
+        angles, quaternions = len(self._angles), len(self._fours)
+        return TransformState(
+            np.full(angles, np.nan),
+            np.zeros(angles),
+            ~np.isnan(self._lowest),
+            np.full((quaternions, 4), np.nan),
+            np.ones(quaternions),
+        )
+
+    def apply(
+        self, values: Values, mask: Mask, state: TransformState
+    ) -> tuple[Values, Mask, TransformState]:
+        """Transforms a row.
+
+        Args:
+            values: (channels,) as sent, in original units.
+            mask: (channels,) True where observed.
+            state: after the row before.
+
+        Returns:
+            Values and mask for the model, and the state after the row.
+        """
+        values, mask = values.copy(), mask.copy()
+        sent, seen = values[self._angles], mask[self._angles]
+        step = np.where(seen & ~np.isnan(state.angle), sent - state.angle, 0.0)
+        turns = state.turns + np.round(step / self._periods)
+        values[self._angles] = np.where(seen, sent - self._periods * turns, sent)
+        inside = _inside(sent, self._lowest, self._periods)
+        last, signs = state.quaternion.copy(), state.sign.copy()
+        for k, four in enumerate(self._fours):
+            own = mask[four]
+            if own.all():
+                unit = _unit(values[four][None])[0]
+                if _length(values[four][None])[0] <= _NO_LENGTH:
+                    mask[four] = False
+                    continue
+                if (unit * last[k]).sum() < 0:
+                    signs[k] = -signs[k]
+                last[k], values[four] = unit, unit * signs[k]
+            elif own.any():
+                values[four] = values[four] * signs[k]
+        return (
+            values,
+            mask,
+            TransformState(
+                np.where(seen, sent, state.angle),
+                turns,
+                state.in_range & (inside | ~seen),
+                last,
+                signs,
+            ),
+        )
+
+    def undo(self, predicted: Values, state: TransformState) -> Values:
+        """Takes predictions back to the convention of what was sent.
+
+        Args:
+            predicted: (times, channels) in original units.
+            state: after the newest row.
+        """
+        values = predicted.copy()
+        back = predicted[:, self._angles] + self._periods * state.turns
+        values[:, self._angles] = np.where(
+            state.in_range, _into_range(back, self._lowest, self._periods), back
+        )
+        for four in self._fours:
+            values[:, four] = _unit(values[:, four])
+        return values
+
+
+def _transformed(trajectory: Trajectory, transforms: Transforms) -> Trajectory:
+    values, observed = trajectory.values.copy(), trajectory.observed.copy()
+    for name, angle in transforms.angles.items():
+        c = trajectory.names.index(name)
+        known = ~np.isnan(values[:, c])
+        sent, seen = values[known, c], observed[known, c]
+        values[known, c] = sent - angle.period * _turns(sent, seen, angle.period)
+    for four in transforms.quaternions:
+        columns = [trajectory.names.index(name) for name in four]
+        values[:, columns], observed[:, columns] = _continuous(
+            values[:, columns], observed[:, columns]
+        )
+    return replace(trajectory, values=values, observed=observed)
+
+
+def _turns(sent: Values, seen: Mask, period: float) -> Values:
+    """(n,) turns to take out of each known value of an angle.
+
+    Observed values follow each other. The others follow the last observation before them through
+    the values between, or lead to the first one.
+    """
+    turns = _counted(sent, period)
+    if seen.all() or not seen.any():
+        return turns
+    at = np.flatnonzero(seen)
+    shift = _counted(sent[at], period) - turns[at]
+    last = np.maximum(np.searchsorted(at, np.arange(len(sent)), side="right") - 1, 0)
+    return turns + shift[last]
+
+
+def _counted(sent: Values, period: float) -> Values:
+    """(n,) turns made since the first value, each step being less than half a turn."""
+    return np.append(0.0, np.cumsum(np.round(np.diff(sent) / period)))[: len(sent)]
+
+
+def _continuous(four: Values, observed: Mask) -> tuple[Values, Mask]:
+    """(n, 4) a quaternion without sign flips, of length 1, and what of it is observed."""
+    gone = observed.all(axis=1) & (_length(four) <= _NO_LENGTH)
+    four = np.where(gone[:, None], np.nan, four)
+    observed = observed & ~gone[:, None]
+    unit = _unit(four)
+    at = np.flatnonzero(observed.all(axis=1))
+    if not len(at):
+        return unit, observed
+    flips = np.cumsum((unit[at][1:] * unit[at][:-1]).sum(axis=1) < 0)
+    signs = np.where(np.append(0, flips) % 2 == 1, -1.0, 1.0)
+    after = np.searchsorted(at, np.arange(len(four)), side="right") - 1
+    sign = np.where(after >= 0, signs[np.maximum(after, 0)], 1.0)
+    hidden = ~observed.any(axis=1)
+    nearest = unit[at[np.maximum(after, 0)]] * signs[np.maximum(after, 0), None]
+    sign = np.where(hidden, np.where((unit * nearest).sum(axis=1) < 0, -1.0, 1.0), sign)
+    whole: Mask = hidden | observed.all(axis=1)  # else its length is not known
+    return np.where(whole[:, None], unit, four) * sign[:, None], observed
+
+
+def _wrapped_back(
+    predicted: Values, times: Values, given: Trajectory, name: str, angle: Angle
+) -> Values:
+    """(rows,) predictions of an angle with the turns of the last observation before each."""
+    c = given.names.index(name)
+    seen = given.observed[:, c]
+    sent = given.values[seen, c]
+    last = np.searchsorted(given.times[seen], times, side="left")  # 0: nothing was observed yet
+    turns = np.append(0.0, _counted(sent, angle.period))[last]
+    back = np.asarray(predicted + angle.period * turns)
+    if angle.lowest is None:
+        return back
+    inside = np.logical_and.accumulate(np.asarray(_inside(sent, angle.lowest, angle.period)))
+    wrapped = np.append(True, inside)[last]
+    return np.where(wrapped, _into_range(back, angle.lowest, angle.period), back)
+
+
+def _inside(value: Any, lowest: Any, period: Any) -> Any:
+    """Whether a value lies within a turn from `lowest`; rounding to float32 does not matter."""
+    slack = 1e-6 * period
+    return (value >= lowest - slack) & (value <= lowest + period + slack)
+
+
+def _into_range(value: Values, lowest: Any, period: Any) -> Values:
+    """Values moved by whole turns into [lowest, lowest + period); those inside stay bit for bit."""
+    return np.asarray(value - period * np.floor((value - lowest) / period))
+
+
+def _length(four: Values) -> Values:
+    return np.asarray(np.sqrt((four * four).sum(axis=1)))
+
+
+def _unit(four: Values) -> Values:
+    """(n, 4) scaled to length 1; what has length 1 or none stays bit for bit."""
+    length = _length(four)
+    keep = (np.abs(length - 1) <= _UNIT_LENGTH) | ~(length > _NO_LENGTH)
+    return four / np.where(keep, 1.0, length)[:, None]
