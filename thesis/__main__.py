@@ -1,4 +1,4 @@
-"""The command `python -m thesis`: `run` makes the runs of the protocol, `report` writes the page."""
+"""The command `python -m thesis`: `run` makes the runs, `report` writes the page."""
 
 from __future__ import annotations
 

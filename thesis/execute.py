@@ -21,14 +21,14 @@ from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, FileFormatError
 from offbeat.evaluation import LAST_VALUE, evaluate
 from offbeat.files import write_json
-from offbeat.metrics import SCORINGS, row_0_constant
+from offbeat.metrics import row_0_constant
 from offbeat.models.model import Model
 from offbeat.models.zoo import make_model
 from offbeat.sweeps.side_by_side import threads_of_torch
 from offbeat.training import fit
 from thesis.protocol import Protocol, Run
 from thesis.provenance import Provenance
-from thesis.record import RUN_COLUMNS, Row, read_log
+from thesis.record import RUN_COLUMNS, SCORINGS, Row, read_log
 
 CONFIG, SCORES, TRAINING = "config.json", "scores.json", "training"
 
@@ -75,8 +75,8 @@ def execute(task: Task) -> None:
     """Trains a model and scores it, or goes on where a process that was killed left off.
 
     A finished run is left alone, and a run that another process works on is waited for, so none is
-    done twice. A run that was begun by other code, on another processor or with another scan backend
-    is begun again: a run is never made half by one and half by the other.
+    done twice. A run that was begun by other code, on another processor or with another scan
+    backend is begun again: a run is never made half by one and half by the other.
 
     Args:
         task: what to do.
@@ -126,8 +126,11 @@ def _execute(task: Task) -> None:
         "run_id": run.run_id,
         **asdict(run),
         "steps": fitted.steps,
-        **{f"{name}_mse": getattr(ours, name).mse for name in SCORINGS},
-        **{f"last_value_{name}_mse": getattr(trivial, name).mse for name in SCORINGS},
+        **{f"{name}_mse": getattr(ours, score).mse for name, score in SCORINGS.items()},
+        **{
+            f"last_value_{name}_mse": getattr(trivial, score).mse
+            for name, score in SCORINGS.items()
+        },
         **_rows_0(model, test),
         "validation_published_mse": fitted.history[-1].validation_published_mse,
         "seconds": before + time.time() - started,

@@ -8,6 +8,7 @@ faster kernel that adds in the same order keeps the fingerprint, another default
 from __future__ import annotations
 
 import hashlib
+import re
 from functools import cache
 
 import numpy as np
@@ -15,13 +16,15 @@ import numpy as np
 from offbeat.data.splits import Scaler
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.evaluation import evaluate
-from offbeat.metrics import SCORINGS
 from offbeat.models.zoo import make_model
 from offbeat.training import fit
 from thesis.protocol import CONTROLS, MODELS, Protocol, Run
+from thesis.record import SCORINGS
 
 _TRAJECTORIES, _ROWS, _CHANNELS = 160, 120, 14
 _FRACTION, _EPOCHS = 0.3, 2
+_OLD = re.compile(r"^head\.")
+"""Names are hashed as they were when the record was begun: weights of the head as `decoder.*`."""
 
 
 def walks() -> Dataset:
@@ -36,7 +39,7 @@ def walks() -> Dataset:
 def fingerprint(protocol: Protocol | None = None) -> str:
     """Hash of weights and scores of every model of the protocol, trained for a few steps.
 
-    Windows, hidden rows, split, order of batches, generator, optimizer, schedule and scoring are those
+    Windows, masks, split, order of batches, generator, optimizer, schedule and scoring are those
     of the protocol; full batches and one that is not full occur. What no small training meets is
     not in it: gradients are never as large here as the norm that the anchored model's are cut to.
     It takes a few seconds.
@@ -65,12 +68,12 @@ def fingerprints(protocol: Protocol) -> dict[str, str]:
             protocol.model_config(label), train, scaler=scaler, seed=run.seed_weights
         )
         fit(model, train, validation, protocol.train_config(run), progress=False)
-        for name, weights in sorted(model.state_dict().items()):
+        state = {_OLD.sub("decoder.", name): value for name, value in model.state_dict().items()}
+        for name, weights in sorted(state.items()):
             digest.update(name.encode() + weights.detach().cpu().numpy().tobytes())
         scores = evaluate({label: model}, test, seed=run.seed_draw).scores
         for who in sorted(scores):
-            digest.update(
-                repr([(name, getattr(scores[who], name).mse) for name in SCORINGS]).encode()
-            )
+            errors = [(name, getattr(scores[who], score).mse) for name, score in SCORINGS.items()]
+            digest.update(repr(errors).encode())
         found[label] = digest.hexdigest()[:12]
     return found

@@ -44,7 +44,7 @@ class Run:
         observed_fraction: share of the rows that stay observed.
         repeat: counted from 0.
         epochs: passes over the training part.
-        seed_draw: of windows, hidden rows, split, order of the batches and generator. It follows from
+        seed_draw: of windows, masks, split, order of the batches and generator. It follows from
             experiment, fraction and repeat alone, so that the models of a repeat are paired.
         seed_weights: of the initial weights.
     """

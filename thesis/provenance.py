@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1]
+import offbeat
+
+PACKAGE = Path(offbeat.__file__).parent
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,22 @@ CURVE_COLUMNS: dict[str, type] = {
 }
 """Columns of the table of curves, a line per epoch; `seconds` is the training time of the epoch."""
 
+SCORINGS: dict[str, str] = {
+    "honest": "after_first_observation",
+    "honest_hidden": "masked",
+    "rows_1_99": "after_first_row",
+    "published": "published",
+}
+"""Names of the scorings in the record, each with its name in `offbeat.metrics.SCORINGS`. The record
+was begun under these names; "honest" is the score after the first observation."""
+
+LOG_COLUMNS: dict[str, str] = {
+    **{name: name for name in CURVE_COLUMNS if name != "run_id"},
+    "validation_honest_mse": "validation_mse",
+    "validation_rows_1_99_mse": "validation_after_first_row_mse",
+}
+"""Columns of the table of curves, each with its name in the `log.csv` of a training."""
+
 GROUP = ("bits", "cpu", "kernel_body", "torch", "data")
 """Runs that agree in these were made alike; those that do not are never mixed in silence."""
 
@@ -166,7 +182,8 @@ def read_log(path: str | Path) -> tuple[Row, ...]:
     path = Path(path)
     if not path.is_file():
         return ()
-    return tuple(_typed_lines(path, {k: v for k, v in CURVE_COLUMNS.items() if k != "run_id"}))
+    lines = _typed_lines(path, {log: CURVE_COLUMNS[name] for name, log in LOG_COLUMNS.items()})
+    return tuple({name: line[log] for name, log in LOG_COLUMNS.items()} for line in lines)
 
 
 def _write_table(folder: Path, name: str, rows: Iterable[Row]) -> None:
@@ -232,5 +249,5 @@ def _check_columns(path: Path, got: Iterable[str], columns: Mapping[str, type]) 
     if missing:
         raise FileFormatError(
             f"{path} lacks the columns {', '.join(sorted(missing))}; give a record that "
-            "`offbeat reproduce` of this version wrote"
+            "`python -m thesis run` of this version wrote"
         )

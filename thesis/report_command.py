@@ -1,4 +1,4 @@
-"""`offbeat report`."""
+"""`python -m thesis report`."""
 
 from __future__ import annotations
 

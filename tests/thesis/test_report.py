@@ -20,7 +20,7 @@ WHITE, BLUE = (255, 255, 255), (0, 114, 178)
 
 def log(*rmse):
     return [
-        SimpleNamespace(epoch=i + 1, steps=10 * (i + 1), validation_honest_mse=value**2)
+        SimpleNamespace(epoch=i + 1, steps=10 * (i + 1), validation_mse=value**2)
         for i, value in enumerate(rmse)
     ]
 
@@ -157,7 +157,7 @@ def test_figures_import_neither_pyplot_nor_torch():
     code = (
         "import sys, types, offbeat.plots.animation\n"
         "from offbeat.plots.figures import learning_curves\n"
-        "e = types.SimpleNamespace(epoch=1, steps=1, validation_honest_mse=1.0)\n"
+        "e = types.SimpleNamespace(epoch=1, steps=1, validation_mse=1.0)\n"
         "learning_curves({'gru': [e]})\n"
         "assert not {'matplotlib.pyplot', 'torch', 'mujoco'} & set(sys.modules)"
     )

@@ -13,7 +13,6 @@ import pytest
 import record_helpers as made
 from PIL import Image
 
-import offbeat
 from offbeat.errors import FileFormatError, InputError
 from offbeat.plots.style import STYLES
 from thesis.__main__ import main as thesis_main
@@ -25,6 +24,7 @@ from thesis.report.figure_boxes import boxes_figure
 from thesis.report.figure_curves import curves_figure
 from thesis.report.figure_robot import channels_figure
 from thesis.report.figure_states import map_figure, states_figure
+from thesis.report.reproduction import write_report
 
 pytestmark = pytest.mark.slow
 
@@ -66,7 +66,7 @@ def report(record, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:  # rendering has tests of its own
         grey = np.full((8, 20, 30, 3), 200, dtype=np.uint8)
         patch.setattr("thesis.report.figure_robot.stills", lambda robot, qpos: grey[: len(qpos)])
-        return offbeat.write_report(folder / "runs", folder / "out", illustrations=drawn())
+        return write_report(folder / "runs", folder / "out", illustrations=drawn())
 
 
 class Reader(HTMLParser):
@@ -159,7 +159,7 @@ def test_other_files_in_the_folder_stay(record, tmp_path):
     kept.write_text("mine")
     few = made.without(record, record.runs["experiment"] == 1)
     few = made.without(few, few.runs["repeat"] > 0)
-    written = offbeat.write_report(few, tmp_path / "out")
+    written = write_report(few, tmp_path / "out")
     assert kept.read_text() == "mine"
     assert any("Figures 3.1, 3.2, 2.5 and A.2 need" in message for message in written.messages)
     assert written.page.is_file()
@@ -167,7 +167,7 @@ def test_other_files_in_the_folder_stay(record, tmp_path):
 
 def test_a_report_of_a_handful_of_runs_is_made_too(record, tmp_path):
     one = made.without(record, np.arange(len(record)) > 0)
-    written = offbeat.write_report(one, tmp_path / "out", repeats=1)
+    written = write_report(one, tmp_path / "out", repeats=1)
     text = written.page.read_text(encoding="utf-8")
     assert "cannot be told yet" in text
     assert 'class="verdict yes"' not in text
@@ -177,11 +177,11 @@ def test_a_report_of_a_handful_of_runs_is_made_too(record, tmp_path):
 def test_bad_arguments_are_refused_before_anything_is_written(record, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file; give the name of a folder"):
-        offbeat.write_report(record, tmp_path / "file")
+        write_report(record, tmp_path / "file")
     with pytest.raises(InputError, match="repeats must be at least 1"):
-        offbeat.write_report(record, tmp_path / "out", repeats=0)
+        write_report(record, tmp_path / "out", repeats=0)
     with pytest.raises(FileFormatError, match="not there"):
-        offbeat.write_report(tmp_path / "nowhere", tmp_path / "out")
+        write_report(tmp_path / "nowhere", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import record_helpers as made
 
-import offbeat
+from offbeat.errors import InputError
 from thesis.__main__ import main as thesis_main
 from thesis.report import circumstances, convergence, findings
 from thesis.report import thesis_numbers as thesis
 from thesis.report.circumstances import Circumstances
 from thesis.report.contents import Contents
+from thesis.report.reproduction import write_report
 from thesis.report.summary import summary
 
 PERCENT = "\N{THIN SPACE}%"
@@ -117,9 +118,14 @@ def test_what_is_inferred_is_called_so_and_commands_are_there(text):
     inferred = text.split("## What is inferred about the thesis")[1].split("\n## ")[0]
     assert "self_feeding=0.5" in inferred
     assert "not public" in inferred
-    for command in ("offbeat reproduce --out runs/thesis", "offbeat report runs/thesis --out"):
+    for command in (
+        "python -m thesis run --out runs/thesis",
+        "python -m thesis report runs/thesis --out",
+    ):
         assert command in text
-    assert len(re.findall(r"^\*`offbeat report", text, flags=re.M)) >= 7  # one under each section
+    assert (
+        len(re.findall(r"^\*`python -m thesis report", text, flags=re.M)) >= 7
+    )  # one under each section
     assert "/work" not in text
 
 
@@ -135,7 +141,7 @@ def test_what_is_inferred_is_called_so_and_commands_are_there(text):
 def test_the_command_names_the_folder_of_the_record_and_no_path_of_a_machine(source, said):
     record = made.synthetic(repeats=1, epochs=2, fractions=(0.9,), experiments=(2,))
     text = summary(contents_of(made.Record(record.runs, record.curves, source), repeats=10))
-    assert f"offbeat report {said} --out runs/report --summary" in text
+    assert f"python -m thesis report {said} --out runs/report --summary" in text
     assert "someone" not in text
 
 
@@ -318,5 +324,5 @@ def test_the_command_writes_the_document_where_it_is_told(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["summary"] == str(where)
     assert where.read_text(encoding="utf-8").startswith("# The thesis, reproduced")
     assert not (tmp_path / "out" / "summary.md").exists()
-    with pytest.raises(offbeat.errors.InputError, match="give the name of a file"):
-        offbeat.write_report(two, tmp_path / "out", summary=tmp_path)
+    with pytest.raises(InputError, match="give the name of a file"):
+        write_report(two, tmp_path / "out", summary=tmp_path)

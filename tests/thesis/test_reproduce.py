@@ -31,7 +31,7 @@ from thesis.fingerprint import fingerprint
 from thesis.progress import seconds_left
 from thesis.protocol import Protocol, select
 from thesis.publish import publish
-from thesis.record import CURVE_COLUMNS, RUN_COLUMNS, Record
+from thesis.record import CURVE_COLUMNS, RUN_COLUMNS, SCORINGS, Record
 from thesis.reproduce import reproduce
 
 
@@ -107,9 +107,9 @@ def test_a_run_is_a_folder_with_config_log_scores_and_a_model_that_scores_as_rec
     _, _, test = SMALL.cut(recorded, run)
     scores = ob.evaluate(model, test, seed=run.seed_draw).scores
     row = Record.read(done).runs[run.run_id]
-    for name in ("published", "rows_1_99", "honest", "honest_hidden"):
-        assert getattr(scores[run.model], name).mse == row[f"{name}_mse"]
-        assert getattr(scores["last_value"], name).mse == row[f"last_value_{name}_mse"]
+    for name, score in SCORINGS.items():
+        assert getattr(scores[run.model], score).mse == row[f"{name}_mse"]
+        assert getattr(scores["last_value"], score).mse == row[f"last_value_{name}_mse"]
     assert model.scaler.to_dict() == ob.Scaler.fit("divide_by_max", recorded).to_dict()
 
 

@@ -168,7 +168,8 @@ class Contents:
         if self.illustrations is None:
             missing.append(
                 "Figures 3.1, 3.2, 2.5 and A.2 need recordings and trained models: run "
-                "'offbeat report' where the checkpoints of the runs and the extra 'sim' are."
+                "'python -m thesis report' where the checkpoints of the runs are, with the extra "
+                "'sim'."
             )
             return {p.number: p for p in pictures}, tuple(missing)
         illustrated, why = _illustrated(self.illustrations)

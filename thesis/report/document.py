@@ -10,8 +10,8 @@ from thesis.report.tables_beyond import constant_residual
 
 TITLE = "ODE-GRU-D on irregularly sampled robot motion: the thesis, reproduced"
 
-_REPRODUCE = "offbeat reproduce --out runs/thesis"
-_REPORT = "offbeat report {} --out runs/report"
+_REPRODUCE = "python -m thesis run --out runs/thesis"
+_REPORT = "python -m thesis report {} --out runs/report"
 
 _ROUNDING = 1e-5
 """Scores are sums in single precision."""
@@ -61,8 +61,8 @@ def document(contents: Contents) -> str:
             _method(contents),
         ],
         top=page.warning((*contents.faults, *contents.missing)),
-        foot="Made by offbeat report. The page needs no network; the files beside it hold each "
-        "table as CSV, Markdown and LaTeX, and each figure as PNG and PDF.",
+        foot="Made by python -m thesis report. The page needs no network; the files beside it hold "
+        "each table as CSV, Markdown and LaTeX, and each figure as PNG and PDF.",
     )
 
 

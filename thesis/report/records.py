@@ -14,9 +14,6 @@ from offbeat.errors import FileFormatError, InputError
 from thesis.record import CURVE_COLUMNS, GROUP, RUN_COLUMNS
 from thesis.record import Record as RowRecord
 
-SCORINGS = ("published", "rows_1_99", "honest", "honest_hidden")
-"""The scorings of a record, each as `<scoring>_mse` and as `last_value_<scoring>_mse`."""
-
 PROVENANCE = ("commit", *GROUP)
 """What the runs of one record should share; where they do not, the page says so."""
 
@@ -179,7 +176,7 @@ def read_record(path: str | Path) -> Record:
     if not any((path / f"record{suffix}").is_file() for suffix in (".parquet", ".csv")):
         raise FileFormatError(
             f"{path} holds neither record.parquet nor record.csv; give the folder that "
-            "'offbeat reproduce --out' wrote, or let it finish a run first"
+            "'python -m thesis run --out' wrote, or let it finish a run first"
         )
     read = RowRecord.read(path)
     curves = [line for lines in read.curves.values() for line in lines]

@@ -19,9 +19,9 @@ from thesis.report.tables import SHARES, label, rmse_of
 from thesis.report.tables_beyond import constant_of
 from thesis.report.tables_tests import p_cell, signed
 
-REPRODUCE = "offbeat reproduce --out runs/thesis"
+REPRODUCE = "python -m thesis run --out runs/thesis"
 FOLDER = "runs/thesis"
-REPORT = f"offbeat report {FOLDER} --out runs/report"
+REPORT = f"python -m thesis report {FOLDER} --out runs/report"
 DOCUMENT = f"{REPORT} --summary docs/reproduction.md"
 
 _OURS = "ode_gru_d"
@@ -33,7 +33,8 @@ _INFERRED = (
     "That its GRU and GRU-D were fed their own predictions at half of the rows "
     "(`self_feeding=0.5`): a public code base of that time does so with plain recurrent models "
     "and not with ODE models; how near the thesis' rows come out with it is table A.1, and that "
-    "its generator alone spread scores as the thesis' repeats do is measured in `docs/reproduce.md`.",
+    "its random draws alone spread scores as the thesis' repeats do is measured in "
+    "`docs/reproduce.md`.",
     "Which constant its own draw of initial states had: table A.1 gives the one that each cell "
     "would need; what other draws have is measured in `docs/reproduce.md`.",
     "Everything else that its text leaves open is settled in `docs/deviations.md`.",
@@ -320,7 +321,7 @@ def _made(contents: Contents) -> Iterable[str]:
     typed = circumstances.commands or (REPRODUCE,)
     yield "```\n" + "\n".join(dict.fromkeys((*typed, DOCUMENT))) + "\n```"
     yield (
-        "One run again: `offbeat reproduce --out runs/again --only "
+        "One run again: `python -m thesis run --out runs/again --only "
         "experiment=2,model=ode_rnn,fraction=0.3,repeat=0`; its seeds are in the record "
         "(`seed_draw`, `seed_weights`)."
     )
