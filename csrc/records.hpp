@@ -1,5 +1,6 @@
-// What the module and the bodies share: plain records and nothing else. A body is compiled for an
-// instruction set of its own, so nothing here may be inline code that a linker could share.
+// The records that the Python module and the kernels share. The kernels are compiled once per
+// instruction set. Nothing here may be inline code: the linker keeps one copy of an inline
+// function, and that copy may use instructions that the processor does not have.
 #pragma once
 
 #include <cstdint>
@@ -21,9 +22,9 @@ struct Perceptron {
   int activation = TANH;
 };
 
-// offbeat.kernels.spec.ScanSpec, with the tableau of its solver.
+// offbeat.kernels.spec.ScanSpec with the tableau of its solver.
 struct Spec {
-  int channels = 0, hidden = 0, anchored = 0, ages = 0;
+  int channels = 0, hidden = 0, anchored = 0, time_inputs = 0;
   int cell = CELL_GRU, reset_after = 0;
   Perceptron field, decoder;
   int stages = 1, steps = 1;
@@ -32,59 +33,60 @@ struct Spec {
   int decay_features = 0, decay_rows = CONTINUOUS, input_decay = 0;
 };
 
-// One quantity at each row: element (lane, row, unit) lies at data[lane * by_lane + row * by_row +
-// unit]; data is null where the scan has no such quantity.
+// One quantity of the step inputs. Element (lane, row, unit) is data[lane * by_lane + row * by_row
+// + unit]. `data` is null where the scan does not use the quantity.
 template <class T>
-struct Fact {
+struct Quantity {
   const T* data = nullptr;
   int64_t by_lane = 0, by_row = 0;
 };
 
 template <class T>
-struct Rows {
-  Fact<T> gap, update, updated, values, mask, age, decay_start, decay_end, delta, last;
-  const T* mean = nullptr;      // (channels,)
-  const uint8_t* fed = nullptr; // (rows,) or null
+struct InputPointers {
+  Quantity<T> gap, update, updated, values, mask, time_input, decay_start, decay_end, delta, last;
+  const T* mean = nullptr;  // (channels,)
+  // (rows,) or null: 1 where the decoded state replaces the observed values.
+  const uint8_t* use_prediction = nullptr;
 };
 
-// (lane, row, unit) of a result or of its gradient; null where it is not asked for.
+// (lane, row, unit) of a result or of its gradient. `data` is null where it is not requested.
 template <class T>
 struct Grid {
   T* data = nullptr;
   int64_t by_lane = 0, by_row = 0;
 };
 
-// Lanes that run through the rows together, `vectors` vectors wide.
+// Trajectories that are computed together, one per lane of `vectors` vectors.
 struct Block {
   int first = 0, lanes = 0, vectors = 0, rows = 0;
-  int64_t tape = 0;  // where its tape begins
+  int64_t tape = 0;  // offset of its tape
 };
 
-// Consecutive blocks whose gradients of weights are added up in one place.
-struct Slot {
+// Consecutive blocks whose weight gradients are summed in one buffer.
+struct GradientSlot {
   int first = 0, last = 0;
 };
 
 template <class T>
 struct Job {
   const Spec* spec = nullptr;
-  Rows<T> rows;
+  InputPointers<T> inputs;
   int64_t batch = 0, n_rows = 0;
   const int32_t* order = nullptr;   // lane -> trajectory, longest first
-  const int32_t* source = nullptr;  // lane -> where the facts of its trajectory are
+  const int32_t* source = nullptr;  // lane -> trajectory in the step inputs
   const int32_t* length = nullptr;  // of each lane
   const Block* blocks = nullptr;
-  const Slot* slots = nullptr;
+  const GradientSlot* slots = nullptr;
   const T* packed = nullptr;
-  const T* state = nullptr;         // (batch, state)
-  Grid<T> before, after;            // forward: results; backward: read
-  Grid<T> to_before, to_after;      // backward
-  T* to_state = nullptr;            // (batch, state)
-  T* tape = nullptr;                // null: the backward pass computes it again
-  T* carried = nullptr;             // backward: of each block, between two stretches of its rows
-  T* sums = nullptr;                // of all slots
-  int max_steps = 1;                // over all gaps
-  int group = 4;                    // rows whose weight gradients are added in one go
+  const T* state = nullptr;      // (batch, state)
+  Grid<T> before, after;         // forward: results; backward: read
+  Grid<T> to_before, to_after;   // backward
+  T* to_state = nullptr;         // (batch, state)
+  T* tape = nullptr;             // null: the backward pass recomputes it
+  T* state_gradients = nullptr;  // backward: of each block, between two chunks of its rows
+  T* sums = nullptr;             // weight gradients of all slots
+  int max_steps = 1;             // of the longest gap
+  int group = 4;                 // rows whose weight gradients are added together
 };
 
 // A perceptron applied to many rows.
@@ -94,29 +96,29 @@ struct PerceptronJob {
   const T* packed = nullptr;
   const T* x = nullptr;  // (rows, in)
   int64_t n = 0, x_stride = 0;
-  T* y = nullptr;        // (rows, out)
+  T* y = nullptr;  // (rows, out)
   const T* to_y = nullptr;
-  T* to_x = nullptr;     // or null
+  T* to_x = nullptr;  // or null
   T* tape = nullptr;
   T* sums = nullptr;
   int slots = 0;
 };
 
-// One row of one trajectory, carried in buffers that live as long as the stream.
+// One row of one trajectory, in buffers that the stream owns.
 template <class T>
 struct StreamRow {
   const Spec* spec = nullptr;
   const T* packed = nullptr;
   T gap = 0, update = 0, updated = 0;
-  const T *values = nullptr, *mask = nullptr, *age = nullptr, *decay_start = nullptr,
+  const T *values = nullptr, *mask = nullptr, *time_input = nullptr, *decay_start = nullptr,
           *decay_end = nullptr, *delta = nullptr, *last = nullptr, *mean = nullptr;
-  int fed = 0;
-  T *state = nullptr, *before = nullptr, *after = nullptr;  // (state,) each; unpadded
+  int use_prediction = 0;
+  T *state = nullptr, *before = nullptr, *after = nullptr;  // (state,) each, not padded
   T* scratch = nullptr;
 };
 
 template <class T>
-struct Body {
+struct Kernels {
   int width;  // lanes of a vector
   int64_t (*packed_size)(const Spec&);
   void (*pack)(const Spec&, const T* flat, T* packed);
@@ -124,11 +126,11 @@ struct Body {
   int64_t (*forward_scratch)(const Spec&, int max_steps);
   int64_t (*backward_scratch)(const Spec&, int max_steps, int group);
   int64_t (*sums_size)(const Spec&);
-  // Rows from `begin` on and before `end`, in the order of time; the walk may stop and go on
-  // anywhere. `end` at the block's last row includes the padding behind it.
+  // Computes the rows [begin, end) of a block; the next call may continue at `end`. A call that
+  // reaches the block's last row also fills the padding after it.
   void (*forward)(const Job<T>&, int block, int begin, int end, T* scratch);
-  int64_t (*carried_size)(const Spec&);  // of a block
-  // The same rows backwards; a slot of several blocks must be walked in one go.
+  int64_t (*state_gradient_size)(const Spec&);  // of a block
+  // The same rows in reverse order. A slot of several blocks takes all its rows in one call.
   void (*backward)(const Job<T>&, int slot, int begin, int end, T* scratch);
   void (*reduce)(const Spec&, const T* sums, int slots, T* flat);
 
@@ -151,10 +153,10 @@ struct Body {
   void (*stream_perceptron)(const Perceptron&, const T* packed, const T* x, T* y, T* scratch);
 };
 
-struct Bodies {
+struct InstructionSet {
   const char* name;
-  Body<float> f32;
-  Body<double> f64;
+  Kernels<float> f32;
+  Kernels<double> f64;
 };
 
 }  // namespace offbeat

@@ -17,9 +17,9 @@ import torch
 torch.set_num_threads(1)
 
 # `make sanitize` tests a compiled module of its own, in place of the installed one.
-if folder := os.environ.get("OFFBEAT_TEST_FUSED"):
-    (library,) = Path(folder).glob("_fused*.so")
-    spec = importlib.util.spec_from_file_location("offbeat.kernels._fused", library)
+if folder := os.environ.get("OFFBEAT_TEST_CPU"):
+    (library,) = Path(folder).glob("_cpu*.so")
+    spec = importlib.util.spec_from_file_location("offbeat.kernels._cpu", library)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)

@@ -347,11 +347,11 @@ def test_arrays_are_taken_as_they_are_or_refused() -> None:
     case = problem(seed=1, batch=2, rows=3, channels=2, hidden=3, cell="gru", flow="euler")
     good = {
         "gap": case.rows.gap.numpy(), "update": case.rows.update.numpy(), "updated": None,
-        "values": case.rows.values.numpy(), "mask": case.rows.mask.numpy(), "age": None,
+        "values": case.rows.values.numpy(), "mask": case.rows.mask.numpy(), "time_input": None,
         "decay_start": None, "decay_end": None, "delta": None, "last": None, "mean": None,
-        "fed": None, "length": None,
+        "use_prediction": None, "length": None,
     }  # fmt: skip
-    make = cpu.compiled.Facts_f32
+    make = cpu.compiled.StepInputs_f32
     make(**good)
     with pytest.raises(TypeError):
         make(**{**good, "values": good["values"].astype("float64")})
@@ -428,7 +428,7 @@ def test_a_body_that_cannot_run_here_is_refused(monkeypatch: pytest.MonkeyPatch)
         pass
     monkeypatch.setenv("OFFBEAT_SCAN", "reference")
     assert kernels.backend() == ("reference", "asked for by OFFBEAT_SCAN")
-    monkeypatch.setenv("OFFBEAT_SCAN", "cpu")
+    monkeypatch.setenv("OFFBEAT_SCAN", "avx2")
     monkeypatch.setattr(cpu, "instruction_sets", list)
     with pytest.raises(ob.InputError, match="was not built"):
         kernels.backend()

@@ -35,14 +35,14 @@ template <class A>
 void check_contiguous(const char* name, const A& a) {
   int64_t stride = 1;
   for (size_t i = a.ndim(); i-- > 0;) {
-    if (a.shape(i) > 1 && a.stride(i) != stride)
-      refuse(std::string(name) + " must be contiguous");
+    if (a.shape(i) > 1 && a.stride(i) != stride) refuse(std::string(name) + " must be contiguous");
     stride *= int64_t(a.shape(i));
   }
 }
 
 template <class T>
-Fact<T> fact(const char* name, const Maybe<T>& a, int64_t batch, int64_t rows, int units) {
+Quantity<T> optional_quantity(const char* name, const Maybe<T>& a, int64_t batch, int64_t rows,
+                              int units) {
   if (!a) return {};
   if (units < 0)
     check_shape(name, *a, {batch, rows});
@@ -51,9 +51,9 @@ Fact<T> fact(const char* name, const Maybe<T>& a, int64_t batch, int64_t rows, i
   return {a->data(), a->stride(0), a->stride(1)};
 }
 template <class T>
-Fact<T> needed(const char* name, const Maybe<T>& a, int64_t batch, int64_t rows, int units) {
+Quantity<T> quantity(const char* name, const Maybe<T>& a, int64_t batch, int64_t rows, int units) {
   if (!a) refuse(std::string(name) + " is missing; this scan needs it");
-  return fact(name, a, batch, rows, units);
+  return optional_quantity(name, a, batch, rows, units);
 }
 
 template <class T, class A>
@@ -77,7 +77,7 @@ int64_t perceptron_flat(const Perceptron& p) {
 int64_t flat_size(const Spec& s) {
   const int64_t g = gates_of(s), h = s.hidden;
   int64_t n = 0;
-  if (s.cell != CELL_NONE) n += g * (2 * s.channels + s.ages) + g;
+  if (s.cell != CELL_NONE) n += g * (2 * s.channels + s.time_inputs) + g;
   if (s.cell > CELL_SET) n += g * h;
   if (s.reset_after) n += h;
   if (s.cell != CELL_NONE) n += g * s.anchored;
@@ -90,7 +90,7 @@ Perceptron perceptron_of(const std::vector<int>& sizes, int activation) {
   Perceptron p;
   if (sizes.empty()) return p;
   if (sizes.size() < 2 || sizes.size() > MAX_LAYERS + 1)
-    refuse("a perceptron of the fused body has 1 to " + std::to_string(MAX_LAYERS) +
+    refuse("a perceptron of the compiled backend has 1 to " + std::to_string(MAX_LAYERS) +
            " layers, got " + std::to_string(int(sizes.size()) - 1));
   for (int n : sizes)
     if (n < 1) refuse("layer sizes must be at least 1, got " + std::to_string(n));
@@ -100,22 +100,22 @@ Perceptron perceptron_of(const std::vector<int>& sizes, int activation) {
   return p;
 }
 
-Spec spec_of(int channels, int hidden, int anchored, int ages, int cell, bool reset_after,
+Spec spec_of(int channels, int hidden, int anchored, int time_inputs, int cell, bool reset_after,
              const std::vector<int>& field, int activation,
              const std::vector<std::vector<double>>& a, const std::vector<double>& b, int steps,
              double max_step, int decay_features, int decay_rows, bool input_decay,
              const std::vector<int>& decoder) {
   Spec s;
-  s.channels = channels, s.hidden = hidden, s.anchored = anchored, s.ages = ages;
+  s.channels = channels, s.hidden = hidden, s.anchored = anchored, s.time_inputs = time_inputs;
   s.cell = cell, s.reset_after = reset_after;
-  if (channels < 1 || hidden < 1 || ages < 0 || (anchored != 0 && anchored != channels))
+  if (channels < 1 || hidden < 1 || time_inputs < 0 || (anchored != 0 && anchored != channels))
     refuse("sizes do not fit together: channels " + std::to_string(channels) + ", hidden " +
            std::to_string(hidden) + ", anchored " + std::to_string(anchored));
   if (cell < CELL_NONE || cell > CELL_GRU) refuse("unknown cell");
   if (reset_after && cell != CELL_GRU) refuse("reset_after needs a GRU");
   if (b.empty() || b.size() > MAX_STAGES || a.size() != b.size())
-    refuse("a tableau of the fused body has 1 to " + std::to_string(MAX_STAGES) + " stages, got " +
-           std::to_string(b.size()));
+    refuse("a tableau of the compiled backend has 1 to " + std::to_string(MAX_STAGES) +
+           " stages, got " + std::to_string(b.size()));
   s.stages = int(b.size());
   for (size_t i = 0; i < b.size(); ++i) {
     s.b[i] = b[i];

@@ -1,21 +1,19 @@
 // A batch, forward and backward: part of module.cpp.
 
-// Everything of a call that forward and backward share.
+// What the forward and the backward pass share.
 template <class T>
 struct Call {
   Job<T> job;
   std::vector<int32_t> order, length, source;
   std::vector<Block> blocks;
-  std::vector<Slot> slots;
+  std::vector<GradientSlot> slots;
   int64_t tape = 0;
 
   void order_lanes(int64_t batch, int64_t rows, const int64_t* lengths, const int64_t* index) {
     job.batch = batch, job.n_rows = rows;
     order.resize(batch);
     std::iota(order.begin(), order.end(), 0);
-    auto of = [&](int32_t i) {
-      return lengths ? std::clamp<int64_t>(lengths[i], 0, rows) : rows;
-    };
+    auto of = [&](int32_t i) { return lengths ? std::clamp<int64_t>(lengths[i], 0, rows) : rows; };
     std::stable_sort(order.begin(), order.end(),
                      [&](int32_t i, int32_t j) { return of(i) > of(j); });
     for (int32_t i : order) {
@@ -25,10 +23,10 @@ struct Call {
     job.order = order.data(), job.length = length.data(), job.source = source.data();
   }
 
-  void plan(const Spec& s, const Body<T>& body) {
+  void plan(const Spec& s, const Kernels<T>& kernels) {
     job.spec = &s;
     const int64_t batch = job.batch;
-    const int w = body.width;
+    const int w = kernels.width;
     for (int64_t at = 0; at < batch;) {
       Block b;
       b.first = int(at);
@@ -36,11 +34,11 @@ struct Call {
       b.lanes = int(std::min<int64_t>(batch - at, int64_t(b.vectors) * w));
       b.rows = length[at];
       b.tape = tape;
-      tape += int64_t(b.rows) * body.tape_row(s, job.max_steps, b.vectors);
+      tape += int64_t(b.rows) * kernels.tape_row(s, job.max_steps, b.vectors);
       blocks.push_back(b);
       at += b.lanes;
     }
-    // Sums of gradients: a place of its own for each block, or for some neighbours.
+    // Weight gradients: one slot per block, or per several consecutive blocks.
     const int n = int(blocks.size()), most = 64;
     const int count = std::min(n, most);
     for (int i = 0; i < count; ++i)
@@ -48,15 +46,15 @@ struct Call {
     job.blocks = blocks.data(), job.slots = slots.data();
   }
 
-  // Rows between two looks at who is behind: a sixteenth of all, in whole groups.
-  int stretch() const {
+  // Rows of a chunk: a sixteenth of all rows, in whole groups.
+  int chunk() const {
     const int rows = std::max(1, int(job.n_rows) / 16);
     return (rows + job.group - 1) / job.group * job.group;
   }
 };
 
 template <class T>
-int most_steps(const Spec& s, const Fact<T>& gap, const std::vector<int32_t>& source,
+int most_steps(const Spec& s, const Quantity<T>& gap, const std::vector<int32_t>& source,
                int64_t rows) {
   int64_t most = s.steps;
   if (s.max_step > 0 && s.field.layers) {
@@ -65,15 +63,15 @@ int most_steps(const Spec& s, const Fact<T>& gap, const std::vector<int32_t>& so
       for (int64_t j = 0; j < rows; ++j)
         longest = std::max(longest, gap.data[i * gap.by_lane + j * gap.by_row]);
     const T wanted = std::ceil(longest / T(s.max_step) - T(1e-6));
-    if (!(wanted < T(1e6)))
-      refuse("a gap asks for over a million steps; raise max_step");
+    if (!(wanted < T(1e6))) refuse("a gap asks for over a million steps; raise max_step");
     most = std::max<int64_t>(most, int64_t(wanted));
   }
   return int(most);
 }
 
 template <class T>
-Call<T> prepare(const Spec& s, const Body<T>& body, const Facts<T>& f, const Const<T>& state) {
+Call<T> prepare(const Spec& s, const Kernels<T>& kernels, const StepInputs<T>& f,
+                const Const<T>& state) {
   const int64_t batch = state.ndim() ? int64_t(state.shape(0)) : 0;
   check_shape("state", state, {batch, state_of(s)});
   check_contiguous("state", state);
@@ -88,33 +86,35 @@ Call<T> prepare(const Spec& s, const Body<T>& body, const Facts<T>& f, const Con
   }
   call.job.state = state.data();
   call.order_lanes(batch, f.rows, lengths, f.index ? f.index->data() : nullptr);
-  call.job.max_steps = most_steps(s, call.job.rows.gap, call.source, f.rows);
-  call.plan(s, body);
-  // Enough lanes per addition to the gradients, and no more memory than that takes.
+  call.job.max_steps = most_steps(s, call.job.inputs.gap, call.source, f.rows);
+  call.plan(s, kernels);
+  // Rows whose weight gradients are added together: about eight evaluations of the vector field.
   const int evaluations = s.field.layers ? s.stages * call.job.max_steps : 1;
   call.job.group = std::clamp(8 / evaluations, 1, MAX_GROUP);
   return call;
 }
 
 template <class T>
-std::unique_ptr<Buffer<T>> packed(const Spec& s, const Body<T>& body, const Const<T>& weights) {
+std::unique_ptr<Buffer<T>> packed(const Spec& s, const Kernels<T>& kernels,
+                                  const Const<T>& weights) {
   check_shape("weights", weights, {flat_size(s)});
-  auto buffer = std::make_unique<Buffer<T>>(body.packed_size(s));
-  body.pack(s, weights.data(), buffer->get());
+  auto buffer = std::make_unique<Buffer<T>>(kernels.packed_size(s));
+  kernels.pack(s, weights.data(), buffer->get());
   return buffer;
 }
 
 template <class T>
-int64_t tape_size(const Spec& s, const Bodies& named, const Facts<T>& f, const Const<T>& state) {
-  return prepare<T>(s, typed<T>(named), f, state).tape;
+int64_t tape_size(const Spec& s, const InstructionSet& set, const StepInputs<T>& f,
+                  const Const<T>& state) {
+  return prepare<T>(s, typed<T>(set), f, state).tape;
 }
 
 template <class T>
-void scan_forward(const Spec& s, const Bodies& named, const Const<T>& weights, const Facts<T>& f,
-                  const Const<T>& state, Array<T> before, Array<T> after,
+void scan_forward(const Spec& s, const InstructionSet& set, const Const<T>& weights,
+                  const StepInputs<T>& f, const Const<T>& state, Array<T> before, Array<T> after,
                   std::optional<Array<T>> tape, int threads) {
-  const Body<T>& body = typed<T>(named);
-  Call<T> call = prepare<T>(s, body, f, state);
+  const Kernels<T>& kernels = typed<T>(set);
+  Call<T> call = prepare<T>(s, kernels, f, state);
   Job<T>& job = call.job;
   const int width = state_of(s);
   job.before = grid<T>("before", std::optional<Array<T>>(before), job.batch, job.n_rows, width);
@@ -124,23 +124,24 @@ void scan_forward(const Spec& s, const Bodies& named, const Const<T>& weights, c
     job.tape = tape->data();
   }
   nb::gil_scoped_release unlocked;
-  const auto weight = packed<T>(s, body, weights);
+  const auto weight = packed<T>(s, kernels, weights);
   job.packed = weight->get();
-  std::vector<Walk> walks;
-  for (const Block& b : call.blocks) walks.push_back({b.rows, b.vectors});
-  walk<T>(walks, call.stretch(), threads, body.forward_scratch(s, job.max_steps),
-          [&](int block, int begin, int end, T* scratch) {
-            body.forward(job, block, begin, end, scratch);
-          });
+  std::vector<BlockRun> runs;
+  for (const Block& b : call.blocks) runs.push_back({b.rows, b.vectors});
+  run_chunks<T>(runs, call.chunk(), threads, kernels.forward_scratch(s, job.max_steps),
+                [&](int block, int begin, int end, T* scratch) {
+                  kernels.forward(job, block, begin, end, scratch);
+                });
 }
 
 template <class T>
-void scan_backward(const Spec& s, const Bodies& named, const Const<T>& weights, const Facts<T>& f,
-                   const Const<T>& state, const Const<T>& after, std::optional<Const<T>> tape,
-                   std::optional<Const<T>> to_before, std::optional<Const<T>> to_after,
-                   Array<T> to_weights, Array<T> to_state, int threads, int group) {
-  const Body<T>& body = typed<T>(named);
-  Call<T> call = prepare<T>(s, body, f, state);
+void scan_backward(const Spec& s, const InstructionSet& set, const Const<T>& weights,
+                   const StepInputs<T>& f, const Const<T>& state, const Const<T>& after,
+                   std::optional<Const<T>> tape, std::optional<Const<T>> to_before,
+                   std::optional<Const<T>> to_after, Array<T> to_weights, Array<T> to_state,
+                   int threads, int group) {
+  const Kernels<T>& kernels = typed<T>(set);
+  Call<T> call = prepare<T>(s, kernels, f, state);
   Job<T>& job = call.job;
   if (group > 0) job.group = std::min(group, MAX_GROUP);
   const int width = state_of(s);
@@ -157,23 +158,23 @@ void scan_backward(const Spec& s, const Bodies& named, const Const<T>& weights, 
   }
   T* flat = to_weights.data();
   nb::gil_scoped_release unlocked;
-  const auto weight = packed<T>(s, body, weights);
+  const auto weight = packed<T>(s, kernels, weights);
   job.packed = weight->get();
-  const Buffer<T> sums(int64_t(call.slots.size()) * body.sums_size(s));
+  const Buffer<T> sums(int64_t(call.slots.size()) * kernels.sums_size(s));
   job.sums = sums.get();
-  const Buffer<T> carried(int64_t(call.blocks.size()) * body.carried_size(s));
-  job.carried = carried.get();
-  std::vector<Walk> walks;
-  for (const Slot& slot : call.slots) {
+  const Buffer<T> state_gradients(int64_t(call.blocks.size()) * kernels.state_gradient_size(s));
+  job.state_gradients = state_gradients.get();
+  std::vector<BlockRun> runs;
+  for (const GradientSlot& slot : call.slots) {
     const Block& b = call.blocks[slot.first];
-    walks.push_back({b.rows, b.vectors});
+    runs.push_back({b.rows, b.vectors});
   }
   const bool whole = call.slots.size() < call.blocks.size();
-  walk<T>(walks, whole ? int(job.n_rows) : call.stretch(), threads,
-          body.backward_scratch(s, job.max_steps, job.group),
-          [&](int slot, int begin, int end, T* scratch) {
-            const int rows = walks[slot].rows;
-            body.backward(job, slot, rows - end, rows - begin, scratch);
-          });
-  body.reduce(s, sums.get(), int(call.slots.size()), flat);
+  run_chunks<T>(runs, whole ? int(job.n_rows) : call.chunk(), threads,
+                kernels.backward_scratch(s, job.max_steps, job.group),
+                [&](int slot, int begin, int end, T* scratch) {
+                  const int rows = runs[slot].rows;
+                  kernels.backward(job, slot, rows - end, rows - begin, scratch);
+                });
+  kernels.reduce(s, sums.get(), int(call.slots.size()), flat);
 }

@@ -13,43 +13,44 @@ PerceptronJob<T> perceptron_job(const Perceptron& shape, const Const<T>& weights
 }
 
 template <class T>
-int64_t perceptron_tape(const Perceptron& shape, const Bodies& named, int64_t rows) {
-  const Body<T>& body = typed<T>(named);
-  const int64_t w = 2 * body.width;
-  return (rows + w - 1) / w * body.perceptron_tape_row(shape);
+int64_t perceptron_tape(const Perceptron& shape, const InstructionSet& set, int64_t rows) {
+  const Kernels<T>& kernels = typed<T>(set);
+  const int64_t w = 2 * kernels.width;
+  return (rows + w - 1) / w * kernels.perceptron_tape_row(shape);
 }
 
 template <class T>
-void perceptron_forward(const Perceptron& shape, const Bodies& named, const Const<T>& weights,
+void perceptron_forward(const Perceptron& shape, const InstructionSet& set, const Const<T>& weights,
                         const Const<T>& x, Array<T> y, std::optional<Array<T>> tape, int threads) {
-  const Body<T>& body = typed<T>(named);
+  const Kernels<T>& kernels = typed<T>(set);
   PerceptronJob<T> job = perceptron_job<T>(shape, weights, x);
   check_shape("y", y, {job.n, shape.sizes[shape.layers]});
   check_contiguous("y", y);
   job.y = y.data();
   if (tape) {
-    check_shape("tape", *tape, {perceptron_tape<T>(shape, named, job.n)});
+    check_shape("tape", *tape, {perceptron_tape<T>(shape, set, job.n)});
     job.tape = tape->data();
   }
   nb::gil_scoped_release unlocked;
-  const Buffer<T> panels(body.perceptron_packed_size(shape));
-  body.perceptron_pack(shape, weights.data(), panels.get());
+  const Buffer<T> panels(kernels.perceptron_packed_size(shape));
+  kernels.perceptron_pack(shape, weights.data(), panels.get());
   job.packed = panels.get();
-  const int64_t w = 2 * body.width, blocks = (job.n + w - 1) / w, batch = 16;
-  spread<T>((blocks + batch - 1) / batch, threads, body.perceptron_scratch(shape),
+  const int64_t w = 2 * kernels.width, blocks = (job.n + w - 1) / w, batch = 16;
+  spread<T>((blocks + batch - 1) / batch, threads, kernels.perceptron_scratch(shape),
             [&](int64_t task, T* scratch) {
               for (int64_t b = task * batch; b < std::min(blocks, (task + 1) * batch); ++b)
-                body.perceptron_forward(job, b, scratch);
+                kernels.perceptron_forward(job, b, scratch);
             });
 }
 
 template <class T>
-void perceptron_backward(const Perceptron& shape, const Bodies& named, const Const<T>& weights,
-                         const Const<T>& x, const Const<T>& tape, const Const<T>& to_y,
-                         Array<T> to_weights, std::optional<Array<T>> to_x, int threads) {
-  const Body<T>& body = typed<T>(named);
+void perceptron_backward(const Perceptron& shape, const InstructionSet& set,
+                         const Const<T>& weights, const Const<T>& x, const Const<T>& tape,
+                         const Const<T>& to_y, Array<T> to_weights, std::optional<Array<T>> to_x,
+                         int threads) {
+  const Kernels<T>& kernels = typed<T>(set);
   PerceptronJob<T> job = perceptron_job<T>(shape, weights, x);
-  check_shape("tape", tape, {perceptron_tape<T>(shape, named, job.n)});
+  check_shape("tape", tape, {perceptron_tape<T>(shape, set, job.n)});
   check_shape("to_y", to_y, {job.n, shape.sizes[shape.layers]});
   check_contiguous("to_y", to_y);
   check_shape("to_weights", to_weights, {perceptron_flat(shape)});
@@ -62,14 +63,15 @@ void perceptron_backward(const Perceptron& shape, const Bodies& named, const Con
   job.to_y = to_y.data();
   T* flat = to_weights.data();
   nb::gil_scoped_release unlocked;
-  const Buffer<T> panels(body.perceptron_packed_size(shape));
-  body.perceptron_pack(shape, weights.data(), panels.get());
+  const Buffer<T> panels(kernels.perceptron_packed_size(shape));
+  kernels.perceptron_pack(shape, weights.data(), panels.get());
   job.packed = panels.get();
-  const int64_t w = 2 * body.width, blocks = (job.n + w - 1) / w;
+  const int64_t w = 2 * kernels.width, blocks = (job.n + w - 1) / w;
   job.slots = int(std::clamp<int64_t>(blocks / 32, 1, 16));
-  const Buffer<T> sums(job.slots * body.perceptron_sums(shape));
+  const Buffer<T> sums(job.slots * kernels.perceptron_sums(shape));
   job.sums = sums.get();
-  spread<T>(job.slots, threads, body.perceptron_scratch(shape),
-            [&](int64_t slot, T* scratch) { body.perceptron_backward(job, int(slot), scratch); });
-  body.perceptron_reduce(shape, sums.get(), job.slots, flat);
+  spread<T>(job.slots, threads, kernels.perceptron_scratch(shape), [&](int64_t slot, T* scratch) {
+    kernels.perceptron_backward(job, int(slot), scratch);
+  });
+  kernels.perceptron_reduce(shape, sums.get(), job.slots, flat);
 }

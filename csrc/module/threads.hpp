@@ -4,8 +4,8 @@ template <class T>
 class Buffer {  // aligned to a cache line, not initialised
  public:
   explicit Buffer(int64_t n)
-      : data_(static_cast<T*>(::operator new(size_t(std::max<int64_t>(n, 1)) * sizeof(T),
-                                             std::align_val_t(64)))) {}
+      : data_(static_cast<T*>(
+            ::operator new(size_t(std::max<int64_t>(n, 1)) * sizeof(T), std::align_val_t(64)))) {}
   ~Buffer() { ::operator delete(data_, std::align_val_t(64)); }
   Buffer(const Buffer&) = delete;
   Buffer& operator=(const Buffer&) = delete;
@@ -38,21 +38,21 @@ void spread(int64_t tasks, int threads, int64_t scratch, const Work& work) {
 }
 
 // A walk over the rows of a block, or of a slot of blocks.
-struct Walk {
+struct BlockRun {
   int rows, cost;  // of a row
 };
 
 // Calls work(walk, begin, end, scratch) until each walk has got from 0 to its last row. With
 // several threads it is done in stretches, the walk with most before it first, so that all end
 // together although the blocks may not be a multiple of the threads. Which thread takes which
-// stretch does not matter to the result.
+// chunk does not matter to the result.
 template <class T, class Work>
-void walk(const std::vector<Walk>& walks, int stretch, int threads, int64_t scratch,
-          const Work& work) {
-  const int64_t n = int64_t(walks.size());
+void run_chunks(const std::vector<BlockRun>& runs, int chunk, int threads, int64_t scratch,
+                const Work& work) {
+  const int64_t n = int64_t(runs.size());
   if (threads < 2 || n < 2 || n > 8 * threads) {
     spread<T>(n, threads, scratch,
-              [&](int64_t i, T* memory) { work(int(i), 0, walks[i].rows, memory); });
+              [&](int64_t i, T* memory) { work(int(i), 0, runs[i].rows, memory); });
     return;
   }
   std::mutex mutex;
@@ -65,19 +65,19 @@ void walk(const std::vector<Walk>& walks, int stretch, int threads, int64_t scra
         std::lock_guard<std::mutex> lock(mutex);
         if (mine >= 0) {
           done[mine] = end;
-          taken[mine] = end >= walks[mine].rows;
+          taken[mine] = end >= runs[mine].rows;
         }
         int64_t most = -1;
         mine = -1;
         for (int64_t i = 0; i < n; ++i) {
-          const int64_t left = int64_t(walks[i].rows - done[i]) * walks[i].cost;
+          const int64_t left = int64_t(runs[i].rows - done[i]) * runs[i].cost;
           if (!taken[i] && left > most) most = left, mine = int(i);
         }
         // What is left is in the hands of others, who go on until it is done.
         if (mine < 0) return;
         taken[mine] = true;
         begin = done[mine];
-        end = std::min(walks[mine].rows, begin + stretch);
+        end = std::min(runs[mine].rows, begin + chunk);
       }
       work(mine, begin, end, memory);
     }

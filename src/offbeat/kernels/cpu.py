@@ -30,7 +30,7 @@ from offbeat.kernels.spec import (
 from offbeat.ode import tableau
 
 try:
-    from offbeat.kernels import _fused as _compiled
+    from offbeat.kernels import _cpu as _compiled
 except ImportError as _error:  # built without a compiler
     compiled: Any = None
     why_not = str(_error)
@@ -86,7 +86,7 @@ def own_threads() -> Iterator[None]:
 
 def instruction_sets() -> list[str]:
     """Names of the instruction sets that this processor can run, best first."""
-    return list(compiled.bodies()) if compiled is not None else []
+    return list(compiled.instruction_sets()) if compiled is not None else []
 
 
 def suffix(dtype: torch.dtype) -> str:
@@ -155,7 +155,7 @@ def compiled_spec(spec: ScanSpec) -> Any:
         channels=spec.channels,
         hidden=spec.hidden_size,
         anchored=spec.anchors,
-        ages=spec.ages,
+        time_inputs=spec.ages,
         cell=_CELLS[spec.cell],
         reset_after=spec.reset_after,
         field=list(spec.field),
@@ -181,7 +181,7 @@ def _array(tensor: Tensor | None) -> Any:
 
 
 def _facts(rows: StepInputs | TableSteps, suffix: str) -> Any:
-    made = getattr(compiled, f"Facts_{suffix}")
+    made = getattr(compiled, f"StepInputs_{suffix}")
     fed = torch.frombuffer(bytearray(rows.fed), dtype=torch.uint8).numpy() if rows.fed else None
     if isinstance(rows, TableSteps):
         table = rows.table

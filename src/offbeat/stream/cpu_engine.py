@@ -14,7 +14,7 @@ from offbeat.parts.decay import TrainableDecay
 from offbeat.stream.engine import Arrays, Engine
 from offbeat.stream.torch_engine import TorchEngine
 
-_AGES = {"none": 0, "elapsed": 1, "gap": 2, "delta": 3}
+_TIME_INPUTS = {"none": 0, "elapsed": 1, "gap": 2, "delta": 3}
 
 
 class CpuEngine(Engine):
@@ -37,9 +37,9 @@ class CpuEngine(Engine):
             decoder = [layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers)]
             decoder_weights = _flat([t for layer in layers for t in layer])
         with torch.no_grad():
-            self._live = getattr(cpu.compiled, f"Live_{cpu.suffix(model.dtype)}")(
+            self._live = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")(
                 spec=cpu.compiled_spec(spec),
-                body=backend()[0],
+                instruction_set=backend()[0],
                 weights=_flat(list(model.scan_weights().tensors())),
                 mean=model.mean.numpy(),
                 std=model.std.numpy(),
@@ -47,10 +47,10 @@ class CpuEngine(Engine):
                 decoder_weights=decoder_weights,
                 first_state=model.first_state(1)[0].detach().contiguous().numpy(),
                 unit=model.time_unit,
-                age_unit=model.time_input_unit,
+                time_input_unit=model.time_input_unit,
                 elapsed_limit=statistics.longest_elapsed * limit,
                 longest_delta=statistics.longest_delta * limit,
-                age=_AGES[config.time_input or "none"],
+                time_input=_TIME_INPUTS[config.time_input or "none"],
                 from_first_row=config.clock == "first_row",
                 last_row=config.readout == "last_row",
                 every_row=config.update_rows == "every",

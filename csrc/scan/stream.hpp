@@ -1,13 +1,13 @@
 // One row of one trajectory, without a gradient: part of Scan<T> (scan.hpp). It runs the same
 // `row_forward` as a batch, with vectors over units in place of lanes.
 
-static int stream_facts(const Dims& d) {
-  return LANE_FACTS * VW + 4 * up(d.C, VW) + up(d.ages, VW) + 2 * up(d.F, VW) + up(d.C, VW);
+static int stream_inputs_size(const Dims& d) {
+  return ROW_SCALARS * VW + 4 * up(d.C, VW) + up(d.time_inputs, VW) + 2 * up(d.F, VW) + up(d.C, VW);
 }
 static int64_t stream_scratch(const Spec& s) {
   const Dims d = dims(s);
   const Layout<One> l = layout<One>(s, d, 1);
-  return stream_facts(d) + l.state + l.size + work_size<One>(s) + 8 * VW;
+  return stream_inputs_size(d) + l.state + l.size + work_size<One>(s) + 8 * VW;
 }
 
 static void stream_row(const StreamRow<T>& row) {
@@ -20,10 +20,10 @@ static void stream_row(const StreamRow<T>& row) {
     at += n;
     return here;
   };
-  Facts<One> f{};
-  for (T** lane : {&f.gap, &f.update, &f.updated, &f.alive}) *lane = take(VW);
+  RowInputs<One> f{};
+  for (T** lane : {&f.gap, &f.update, &f.updated, &f.valid}) *lane = take(VW);
   for (int i = 0; i < VW; ++i)
-    f.gap[i] = row.gap, f.update[i] = row.update, f.updated[i] = row.updated, f.alive[i] = 1;
+    f.gap[i] = row.gap, f.update[i] = row.update, f.updated[i] = row.updated, f.valid[i] = 1;
   auto padded = [&](const T* from, int n) {
     T* to = take(up(n, VW));
     if (from)
@@ -32,14 +32,14 @@ static void stream_row(const StreamRow<T>& row) {
   };
   f.values = padded(row.values, d.C);
   f.mask = padded(row.mask, d.C);
-  f.age = padded(row.age, d.ages);
+  f.time_input = padded(row.time_input, d.time_inputs);
   f.start = padded(row.decay_start, d.F);
   f.end = padded(row.decay_end, d.F);
   f.delta = padded(row.delta, d.C);
   f.last = padded(row.last, d.C);
   f.mean = padded(row.mean, d.C);
   f.active = d.cell && row.update != 0;
-  f.fed = row.fed != 0;
+  f.use_prediction = row.use_prediction != 0;
 
   Layout<One> l = layout<One>(s, d, 1);
   // Later steps reuse the place of the first one, but for what a decay has applied so far: with
@@ -47,8 +47,8 @@ static void stream_row(const StreamRow<T>& row) {
   l.step_size = 0;
   T* state = take(l.state + VW);
   T* tape = take(l.size + VW);
-  const Context<One> c{s, p, row.packed, row.packed + p.stream - 2 * up(d.C, VW), l,
-                       take(work_size<One>(s))};
+  const Context<One> c{
+      s, p, row.packed, row.packed + p.stream - 2 * up(d.C, VW), l, take(work_size<One>(s))};
   const int place[3] = {0, l.h_at, l.c_at}, width[3] = {d.A, d.H, d.lstm ? d.H : 0};
   auto unpadded = [&](const T* from, T* to) {
     for (int k = 0; k < 3; ++k)

@@ -43,8 +43,8 @@ static NOINLINE void outer_strip(int pairs, int W, int lanes, const T* const* to
   for (; o < out; ++o) outer_tile<1, NV>(pairs, W, lanes, to_out, o, xt, in, i, sum);
 }
 
-// [unit][lane] to [lane][unit], units padded with zeros; of the lanes that there are.
-static void turn(const T* x, int units, int padded, int W, int lanes, T* xt) {
+// [unit][lane] to [lane][unit] of the lanes in use; units are padded with zeros.
+static void transpose(const T* x, int units, int padded, int W, int lanes, T* xt) {
   T* to[2 * VW];
   for (int lane = 0; lane < lanes; ++lane) {
     to[lane] = xt + int64_t(lane) * padded;
@@ -53,14 +53,14 @@ static void turn(const T* x, int units, int padded, int W, int lanes, T* xt) {
   units_to_lanes(x, units, lanes, W, to);
 }
 
-static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, int lanes,
-                               const T* const* to_out, const T* const* x, T* sums, T* xt) {
+static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, int lanes, const T* const* to_out,
+                               const T* const* x, T* sums, T* xt) {
   const int in = up(m.in, VW);
   T* sum = sums + m.sum;
   for (int first = 0; first < pairs; first += PAIRS_AT_ONCE) {
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
     for (int e = 0; e < n; ++e)
-      turn(x[first + e], m.in, in, W, lanes, xt + int64_t(e) * lanes * in);
+      transpose(x[first + e], m.in, in, W, lanes, xt + int64_t(e) * lanes * in);
     for (int i = 0; i < in;) {  // strips of three vectors, the rest in pairs where it can be
       const int left = (in - i) / VW;
       if (left == 3 || left > 4) {
@@ -94,11 +94,11 @@ static void flush(const Map& map, Pairs& pairs, int W, int lanes, T* sums, T* xt
 }
 
 // Where the gradients of a row's affine maps lie until they are added; offsets in units.
-struct Slots {
-  int gate, held, start, end, decoder, field, field_size, size;
+struct GradientLayout {
+  int gate, inner, start, end, decoder, field, field_size, size;
 };
-static Slots slots(const Spec& s, const Dims& d, int max_steps) {
-  Slots l{};
+static GradientLayout gradient_layout(const Spec& s, const Dims& d, int max_steps) {
+  GradientLayout l{};
   int at = 0;
   auto take = [&](int n) {
     const int here = at;
@@ -106,7 +106,7 @@ static Slots slots(const Spec& s, const Dims& d, int max_steps) {
     return here;
   };
   l.gate = take(d.G);
-  l.held = take(d.H);
+  l.inner = take(d.H);
   l.start = take(d.F ? d.H : 0);
   l.end = take(d.F ? d.H : 0);
   l.decoder = at;
@@ -120,10 +120,10 @@ static Slots slots(const Spec& s, const Dims& d, int max_steps) {
 template <class P>
 struct Back {
   const Context<P>& c;
-  Slots slots;
+  GradientLayout places;
   Pairs& pairs;
   T *sums, *xt;
-  T *z, *shown, *stage_gradients;  // scratch
+  T *z, *to_values, *stage_gradients;  // scratch
 
   void push(int id, const T* to_out, const T* x) {
     if (pairs.count[id] == MAX_PAIRS) flush(c.map, pairs, P::W, c.lanes, sums, xt);
@@ -137,7 +137,7 @@ struct Back {
 // the one of its argument.
 template <class P>
 static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int first, const Net& n,
-                              const T* x, const T* kept, T* kept_gradients, T* to_x) {
+                                       const T* x, const T* kept, T* kept_gradients, T* to_x) {
   constexpr int W = P::W;
   T* to_out = kept_gradients;
   for (int l = 0; l + 1 < shape.layers; ++l) to_out += int64_t(shape.sizes[l + 1]) * W;
@@ -162,8 +162,8 @@ static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int 
 
 // `g` comes as the gradient of the state after the row and leaves as the one before the gap.
 template <class P>
-static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* g,
-                         const Job<T>& job, const Block& b, int row) {
+static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* tape, T* slot, T* g,
+                                  const Job<T>& job, const Block& b, int row) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
   const Dims& d = c.map.d;
@@ -172,8 +172,8 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
   auto at = [&](int units) { return tape + int64_t(units) * W; };
   auto to = [&](int units) { return slot + int64_t(units) * W; };
   T* gh = g + int64_t(l.h_at) * W;
-  T* gate = to(k.slots.gate);
-  const bool shown_matters = f.active && (f.fed || s.input_decay);
+  T* gate = to(k.places.gate);
+  const bool values_need_gradient = f.active && (f.use_prediction || s.input_decay);
 
   if (f.active) {
     cell_backward<P>(k, f, tape, slot, gh, g + int64_t(l.c_at) * W);
@@ -186,28 +186,28 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
         store<T>(g + i, (1 - m) * load<T>(g + i) - m * load<T>(k.z + i));
       });
     }
-    if (shown_matters)
-      P::template transposed<false>(c.map.m[M_IN], c.packed, c.lanes, gate, k.shown);
+    if (values_need_gradient)
+      P::template transposed<false>(c.map.m[M_IN], c.packed, c.lanes, gate, k.to_values);
   }
   collect<P>(job, b, job.to_before, row, d.S, true, g);
 
-  // Flow and decay, last step first.
+  // Dynamics and decay, last step first.
   T steps[W], span[W];
   const int most = s.field.layers ? steps_of<P>(s, f.gap, steps) : 1;
   const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
-  T* to_start = to(k.slots.start);
-  T* to_end = to(k.slots.end);
-  T* to_known = k.z + int64_t(widest<P>(s)) * W;
+  T* to_start = to(k.places.start);
+  T* to_end = to(k.places.end);
+  T* to_applied_before = k.z + int64_t(widest<P>(s)) * W;
   if (d.F) {
     zero(to_start, int64_t(d.H) * W);
     zero(to_end, int64_t(d.H) * W);
-    zero(to_known, int64_t(d.H) * W);
+    zero(to_applied_before, int64_t(d.H) * W);
   }
   for (int q = most - 1; q >= 0; --q) {
     const T* step = at(l.step) + int64_t(q) * l.step_size * W;
     if (s.field.layers) {
       for (int i = 0; i < W; ++i) span[i] = T(q) < steps[i] ? f.gap[i] / steps[i] : T(0);
-      T* kept = to(k.slots.field) + int64_t(q) * s.stages * k.slots.field_size * W;
+      T* kept = to(k.places.field) + int64_t(q) * s.stages * k.places.field_size * W;
       runge_kutta_backward<P>(k, span, g, step + int64_t(l.stage) * W, kept);
     }
     if (!d.F) continue;
@@ -218,42 +218,43 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
     P::each(d.H, [&](int64_t i, int lane) {
       const V first = load<T>(at(l.start) + i), last = load<T>(at(l.end) + i);
       const V fresh = load<T>(f.updated + lane);
-      V known;
+      V applied_before;
       if (q)
-        known = load<T>(previous + i);
+        applied_before = load<T>(previous + i);
       else if (s.decay_rows != CONTINUOUS)
-        known = splat(0);
+        applied_before = splat(0);
       else
-        known = fresh != T(0) ? splat(0) : clip(first);
-      V share = splat(1), reached = last;
+        applied_before = fresh != T(0) ? splat(0) : clip(first);
+      V fraction = splat(1), exponent = last;
       if (!one_shot) {
-        share = T(q + 1) / load<T>(steps + lane);
-        share = share > T(1) ? splat(1) : share;
-        reached = fma(share, last - first, first);
+        fraction = T(q + 1) / load<T>(steps + lane);
+        fraction = fraction > T(1) ? splat(1) : fraction;
+        exponent = fma(fraction, last - first, first);
       }
-      const V bounded = clip(reached), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
+      const V bounded = clip(exponent), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
       store<T>(gh + i, gradient * gamma);
-      V to_grown = -gamma * gradient * load<T>(arrived + i);
-      if (s.field.layers) to_grown = bounded - known >= T(0) ? to_grown : splat(0);
+      V to_growth = -gamma * gradient * load<T>(arrived + i);
+      if (s.field.layers) to_growth = bounded - applied_before >= T(0) ? to_growth : splat(0);
       // The larger of the two is what the state carries on; a tie shares the gradient.
-      const V carried = load<T>(to_known + i);
-      const V share_reached =
-          bounded > known ? splat(1) : bounded == known ? splat(T(0.5)) : splat(0);
-      const V to_bounded = to_grown + carried * share_reached;
-      const V to_previous = carried * (1 - share_reached) - to_grown;
-      const V to_reached = to_bounded * inside(reached);
-      V start = load<T>(to_start + i) + (1 - share) * to_reached;
-      store<T>(to_end + i, load<T>(to_end + i) + share * to_reached);
+      const V state_gradients = load<T>(to_applied_before + i);
+      const V fraction_exponent = bounded > applied_before    ? splat(1)
+                                  : bounded == applied_before ? splat(T(0.5))
+                                                              : splat(0);
+      const V to_bounded = to_growth + state_gradients * fraction_exponent;
+      const V to_previous = state_gradients * (1 - fraction_exponent) - to_growth;
+      const V to_exponent = to_bounded * inside(exponent);
+      V start = load<T>(to_start + i) + (1 - fraction) * to_exponent;
+      store<T>(to_end + i, load<T>(to_end + i) + fraction * to_exponent);
       if (q == 0 && s.decay_rows == CONTINUOUS)
         start = start + (fresh != T(0) ? splat(0) : to_previous * inside(first));
       store<T>(to_start + i, start);
-      store<T>(to_known + i, to_previous);
+      store<T>(to_applied_before + i, to_previous);
     });
   }
   if (d.F) {
     P::each(d.H, [&](int64_t i, int lane) {
-      const V alive = load<T>(f.alive + lane);
-      V start = load<T>(to_start + i) * alive, end = load<T>(to_end + i) * alive;
+      const V valid = load<T>(f.valid + lane);
+      V start = load<T>(to_start + i) * valid, end = load<T>(to_end + i) * valid;
       if (s.decay_rows != CONTINUOUS) end = end + start, start = splat(0);
       if (s.decay_rows == OBSERVED_ROWS) end = end * load<T>(f.update + lane);
       store<T>(to_start + i, start);
@@ -263,17 +264,16 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
     if (s.decay_rows == CONTINUOUS) k.push(M_DECAY, to_start, f.start);
   }
 
-  if (!shown_matters) return;
-  if (f.fed) {
-    T* kept = to(k.slots.decoder);
+  if (!values_need_gradient) return;
+  if (f.use_prediction) {
+    T* kept = to(k.places.decoder);
     T* to_out = kept;
     for (int q = 0; q + 1 < s.decoder.layers; ++q) to_out += int64_t(s.decoder.sizes[q + 1]) * W;
-    copy<P>(d.C, k.shown, to_out);
-    evaluate_backward<P>(k, s.decoder, M_DECODER, l.decoder_net, at(l.carried), at(l.decoder),
-                         kept, k.shown);
-    P::each(d.H, [&](int64_t i, int) {
-      store<T>(gh + i, load<T>(gh + i) + load<T>(k.shown + i));
-    });
+    copy<P>(d.C, k.to_values, to_out);
+    evaluate_backward<P>(k, s.decoder, M_DECODER, l.decoder_net, at(l.h_before), at(l.decoder),
+                         kept, k.to_values);
+    P::each(d.H,
+            [&](int64_t i, int) { store<T>(gh + i, load<T>(gh + i) + load<T>(k.to_values + i)); });
   } else {
     const T* weight = c.input_decay;
     const T* bias = weight + up(d.C, VW);
@@ -283,7 +283,7 @@ static NOINLINE void row_backward(Back<P>& k, const Facts<P>& f, const T* tape, 
       const V delta = load<T>(f.delta + i), mean = P::constant(f.mean, n);
       const V raw = fma(P::constant(weight, n), delta, P::constant(bias, n));
       const V gamma = exp_(raw < T(0) ? splat(0) : -raw);
-      V to_raw = -gamma * load<T>(k.shown + i) * (load<T>(f.last + i) - mean);
+      V to_raw = -gamma * load<T>(k.to_values + i) * (load<T>(f.last + i) - mean);
       to_raw = raw >= T(0) ? to_raw : splat(0);
       to_raw = load<T>(f.mask + i) != T(0) ? splat(0) : to_raw;
       store<T>(to_weight + n * VW, load<T>(to_weight + n * VW) + to_raw * delta);
@@ -303,8 +303,8 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
   const int64_t size = int64_t(driven) * W;
   T* to_stage = k.stage_gradients;
   for (int j = s.stages - 1; j >= 0; --j) {
-    T* own = kept + int64_t(j) * k.slots.field_size * W;
-    T* to_slope = own + int64_t(k.slots.field_size - driven) * W;
+    T* own = kept + int64_t(j) * k.places.field_size * W;
+    T* to_slope = own + int64_t(k.places.field_size - driven) * W;
     P::each(driven, [&](int64_t i, int lane) {
       V sum = T(s.b[j]) * load<T>(g + i);
       for (int q = j + 1; q < s.stages; ++q)
@@ -324,7 +324,7 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
 
 // Fills the gradient of the gates; turns those of h and of the memory into the ones before.
 template <class P>
-static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape, T* slot, T* gh,
+static NOINLINE void cell_backward(Back<P>& k, const RowInputs<P>& f, const T* tape, T* slot, T* gh,
                                    T* gc) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
@@ -335,8 +335,8 @@ static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape,
   const T* h = tape + int64_t(l.before + l.h_at) * W;
   const T* memory = tape + int64_t(l.before + l.c_at) * W;
   const T* gate = tape + int64_t(l.gate) * W;
-  const T* held = tape + int64_t(l.held) * W;
-  T* to_gate = slot + int64_t(k.slots.gate) * W;
+  const T* inner = tape + int64_t(l.inner) * W;
+  T* to_gate = slot + int64_t(k.places.gate) * W;
 
   if (s.cell == CELL_SET) {
     P::each(d.H, [&](int64_t i, int lane) {
@@ -357,38 +357,38 @@ static NOINLINE void cell_backward(Back<P>& k, const Facts<P>& f, const T* tape,
       }
       const V forget = load<T>(gate + i), insert = load<T>(gate + n + i);
       const V node = load<T>(gate + 2 * n + i), output = load<T>(gate + 3 * n + i);
-      const V bent = load<T>(held + i), g2 = load<T>(gc + i), new_h = g * on;
-      const V to_fresh = fma(new_h * output, fma(-bent, bent, splat(1)), g2 * on);
+      const V squashed = load<T>(inner + i), g2 = load<T>(gc + i), new_h = g * on;
+      const V to_fresh = fma(new_h * output, fma(-squashed, squashed, splat(1)), g2 * on);
       store<T>(gc + i, fma(to_fresh, forget, g2 * off));
       store<T>(to_gate + i, to_fresh * load<T>(memory + i) * forget * (1 - forget));
       store<T>(to_gate + n + i, to_fresh * node * insert * (1 - insert));
       store<T>(to_gate + 2 * n + i, to_fresh * insert * fma(-node, node, splat(1)));
-      store<T>(to_gate + 3 * n + i, new_h * bent * output * (1 - output));
+      store<T>(to_gate + 3 * n + i, new_h * squashed * output * (1 - output));
     });
     k.push(M_REC, to_gate, h);
     P::template transposed<true>(c.map.m[M_REC], c.packed, c.lanes, to_gate, gh);
     return;
   }
-  T* to_held = slot + int64_t(k.slots.held) * W;
+  T* to_inner = slot + int64_t(k.places.inner) * W;
   T* to_reset = k.z;
   P::each(d.H, [&](int64_t i, int lane) {
     const V on = load<T>(f.update + lane), g = load<T>(gh + i), update = load<T>(gate + i);
-    const V candidate = load<T>(gate + 2 * n + i), share = update * on;
-    const V to_candidate = g * share * fma(-candidate, candidate, splat(1));
+    const V candidate = load<T>(gate + 2 * n + i), fraction = update * on;
+    const V to_candidate = g * fraction * fma(-candidate, candidate, splat(1));
     store<T>(to_gate + i, g * on * (candidate - load<T>(h + i)) * update * (1 - update));
     store<T>(to_gate + 2 * n + i, to_candidate);
-    store<T>(gh + i, g - g * share);
+    store<T>(gh + i, g - g * fraction);
     if (s.reset_after) {
       const V r = load<T>(gate + n + i);
-      store<T>(to_held + i, to_candidate * r);
-      store<T>(to_gate + n + i, to_candidate * load<T>(held + i) * r * (1 - r));
+      store<T>(to_inner + i, to_candidate * r);
+      store<T>(to_gate + n + i, to_candidate * load<T>(inner + i) * r * (1 - r));
     }
   });
   if (s.reset_after) {
-    k.push(M_CAND, to_held, h);
-    P::template transposed<true>(c.map.m[M_CAND], c.packed, c.lanes, to_held, gh);
+    k.push(M_CAND, to_inner, h);
+    P::template transposed<true>(c.map.m[M_CAND], c.packed, c.lanes, to_inner, gh);
   } else {
-    k.push(M_CAND, to_gate + 2 * n, held);
+    k.push(M_CAND, to_gate + 2 * n, inner);
     P::template transposed<false>(c.map.m[M_CAND], c.packed, c.lanes, to_gate + 2 * n, to_reset);
     P::each(d.H, [&](int64_t i, int) {
       const V r = load<T>(gate + n + i), g = load<T>(to_reset + i);
@@ -411,8 +411,8 @@ static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
   using P = Many<2>;
   const Map p = map(s);
   const Dims& d = p.d;
-  const int64_t per_row = tape_row(s, max_steps, 2) + facts_size(d, P::W) +
-                          int64_t(slots(s, d, max_steps).size) * P::W;
+  const int64_t per_row = tape_row(s, max_steps, 2) + row_inputs_size(d, P::W) +
+                          int64_t(gradient_layout(s, d, max_steps).size) * P::W;
   return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W +
          int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * s.stages) * P::W +
          int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
@@ -424,7 +424,7 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
   const Spec& s = *job.spec;
   const Map p = map(s);
   const Dims& d = p.d;
-  const Slots places = slots(s, d, job.max_steps);
+  const GradientLayout places = gradient_layout(s, d, job.max_steps);
   T* at = scratch;
   auto take = [&](int64_t n) {
     T* here = at;
@@ -435,14 +435,14 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
   T* state = take(d.S * W);
   const Context<P> c = context<P>(job, b, p, take(work_size<P>(s)));
   const int64_t row_size = int64_t(c.l.size) * W, slot_size = int64_t(places.size) * W;
-  const int64_t fact_size = facts_size(d, P::W);
+  const int64_t inputs_size = row_inputs_size(d, P::W);
   Pairs pairs;
-  T* z = take((widest<P>(s) + d.H) * W);  // the carried gradient of a decay lies behind it
-  T* shown = take((d.C > d.H ? d.C : d.H) * W);
+  T* z = take((widest<P>(s) + d.H) * W);  // the gradient of the applied exponent follows it
+  T* to_values = take((d.C > d.H ? d.C : d.H) * W);
   T* stage_gradients = take(int64_t(d.D) * s.stages * W);
   T* xt = take(int64_t(PAIRS_AT_ONCE) * W * widest_input(p));
-  Back<P> k{c, places, pairs, sums, xt, z, shown, stage_gradients};
-  T* lanes = take(fact_size * job.group);
+  Back<P> k{c, places, pairs, sums, xt, z, to_values, stage_gradients};
+  T* lanes = take(inputs_size * job.group);
   T* gradients = take(slot_size * job.group);
   T* own = job.tape ? nullptr : take(row_size * job.group);
 
@@ -454,7 +454,7 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
       collect<P>(job, b, job.to_before, int(row), d.S, true, g);
     }
   }
-  Facts<P> f[MAX_GROUP];
+  RowInputs<P> f[MAX_GROUP];
   for (int last = end; last > begin; last -= job.group) {
     const int first = last - begin > job.group ? last - job.group : begin;
     if (!job.tape) {
@@ -464,7 +464,7 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
         first_state<P>(job, b, state);
     }
     for (int row = first; row < last; ++row) {
-      f[row - first] = facts<P>(d, lanes + (row - first) * fact_size);
+      f[row - first] = row_inputs<P>(d, lanes + (row - first) * inputs_size);
       gather<P>(job, d, b, row, f[row - first], -job.group);
       if (!job.tape) row_forward<P>(c, f[row - first], state, own + (row - first) * row_size);
     }
@@ -483,7 +483,7 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
   }
 }
 
-static int64_t carried_size(const Spec& s) { return int64_t(dims(s).S) * 2 * VW; }
+static int64_t state_gradient_size(const Spec& s) { return int64_t(dims(s).S) * 2 * VW; }
 
 static void backward(const Job<T>& job, int slot, int begin, int end, T* scratch) {
   const int64_t size = sums_size(*job.spec);
@@ -491,7 +491,7 @@ static void backward(const Job<T>& job, int slot, int begin, int end, T* scratch
   if (end >= job.blocks[job.slots[slot].first].rows) zero(sums, size);
   for (int i = job.slots[slot].first; i < job.slots[slot].last; ++i) {
     const Block& b = job.blocks[i];
-    T* g = job.carried + i * carried_size(*job.spec);
+    T* g = job.state_gradients + i * state_gradient_size(*job.spec);
     if (b.vectors == 2)
       block_backward<Many<2>>(job, b, begin, end, g, sums, scratch);
     else
@@ -514,7 +514,7 @@ static void reduce_lanes(const T* sums, int units, T* flat) {
   }
 }
 
-// Slots are added in their order, whoever filled them.
+// GradientLayout are added in their order, whoever filled them.
 static void reduce(const Spec& s, const T* sums, int n, T* flat) {
   const Map p = map(s);
   zero(flat, p.flat);

@@ -1,9 +1,9 @@
-// The table of functions that a body offers; included at the end of each body.
+// The table of the functions of one instruction set.
 
 template <class T>
-constexpr Body<T> table() {
+constexpr Kernels<T> make_kernels() {
   using S = Scan<T>;
-  Body<T> t{};
+  Kernels<T> t{};
   t.width = S::VW;
   t.packed_size = S::packed_size;
   t.pack = S::pack;
@@ -12,7 +12,7 @@ constexpr Body<T> table() {
   t.backward_scratch = S::backward_scratch;
   t.sums_size = S::sums_size;
   t.forward = S::forward;
-  t.carried_size = S::carried_size;
+  t.state_gradient_size = S::state_gradient_size;
   t.backward = S::backward;
   t.reduce = S::reduce;
   t.perceptron_packed_size = S::perceptron_packed_size;

@@ -14,9 +14,10 @@ namespace offbeat {
 namespace {
 #include "vector.hpp"
 #include "scan.hpp"
-#include "table.hpp"
+#include "kernels.hpp"
 }  // namespace
 
-extern const Bodies body_baseline;
-constexpr Bodies body_baseline = {"baseline", table<float>(), table<double>()};
+extern const InstructionSet kernels_baseline;
+constexpr InstructionSet kernels_baseline = {"baseline", make_kernels<float>(),
+                                             make_kernels<double>()};
 }  // namespace offbeat

@@ -1,24 +1,36 @@
-// What is known of the rows of a batch, checked: part of module.cpp.
+// The step inputs of a batch, checked: part of module.cpp.
 
-enum { GAP, UPDATE, UPDATED, VALUES, MASK, AGE, DECAY_START, DECAY_END, DELTA, LAST, QUANTITIES };
-const char* const NAMES[QUANTITIES] = {"gap", "update",      "updated",   "values", "mask",
-                                       "age", "decay_start", "decay_end", "delta",  "last"};
+enum {
+  GAP,
+  UPDATE,
+  UPDATED,
+  VALUES,
+  MASK,
+  TIME_INPUT,
+  DECAY_START,
+  DECAY_END,
+  DELTA,
+  LAST,
+  QUANTITIES
+};
+const char* const NAMES[QUANTITIES] = {"gap",        "update",      "updated",   "values", "mask",
+                                       "time_input", "decay_start", "decay_end", "delta",  "last"};
 
-// What is known of the rows: an array per quantity, or one table of many trajectories that has the
-// quantities side by side, and which of its trajectories are meant.
+// Step inputs as Python passes them: one array per quantity, or a table of many trajectories with
+// the quantities as columns and the indices of the trajectories of this batch.
 template <class T>
-struct Facts {
+struct StepInputs {
   std::vector<Maybe<T>> arrays;
   Maybe<T> mean;
-  std::optional<Const<uint8_t>> fed;
+  std::optional<Const<uint8_t>> use_prediction;
   std::optional<Const<int64_t>> length;
   Maybe<T> table;  // (trajectories, rows, columns)
   std::optional<Const<int64_t>> index;
   std::vector<std::pair<int, int>> places;  // first column and number of columns, 0: none
   int64_t rows = 0;
 
-  Fact<T> get(int which, int64_t batch, int units) const {
-    if (!table) return needed(NAMES[which], arrays[which], batch, rows, units);
+  Quantity<T> get(int which, int64_t batch, int units) const {
+    if (!table) return quantity(NAMES[which], arrays[which], batch, rows, units);
     const auto [first, width] = places[which];
     if (!width) refuse(std::string(NAMES[which]) + " is missing; this scan needs it");
     if (width != std::max(units, 1) || first < 0 || first + width > int64_t(table->shape(2)))
@@ -28,7 +40,7 @@ struct Facts {
     return {table->data() + first, table->stride(0), table->stride(1)};
   }
 
-  // Checks that the table has the trajectories and rows that are asked for.
+  // Checks that the table has the requested trajectories and rows.
   void check_table(int64_t batch) const {
     check_shape("index", *index, {batch});
     check_contiguous("index", *index);
@@ -44,13 +56,13 @@ struct Facts {
 };
 
 template <class T>
-void take_rows(Job<T>& job, const Spec& s, const Facts<T>& f, int64_t batch) {
-  Rows<T>& r = job.rows;
+void take_rows(Job<T>& job, const Spec& s, const StepInputs<T>& f, int64_t batch) {
+  InputPointers<T>& r = job.inputs;
   r.gap = f.get(GAP, batch, -1);
   r.update = f.get(UPDATE, batch, -1);
   r.values = f.get(VALUES, batch, s.channels);
   r.mask = f.get(MASK, batch, s.channels);
-  if (s.ages) r.age = f.get(AGE, batch, s.ages);
+  if (s.time_inputs) r.time_input = f.get(TIME_INPUT, batch, s.time_inputs);
   if (s.decay_features) {
     r.decay_start = f.get(DECAY_START, batch, s.decay_features);
     r.decay_end = f.get(DECAY_END, batch, s.decay_features);
@@ -63,8 +75,8 @@ void take_rows(Job<T>& job, const Spec& s, const Facts<T>& f, int64_t batch) {
     check_shape("mean", *f.mean, {s.channels});
     r.mean = f.mean->data();
   }
-  if (s.decoder.layers && f.fed) {
-    check_shape("fed", *f.fed, {f.rows});
-    r.fed = f.fed->data();
+  if (s.decoder.layers && f.use_prediction) {
+    check_shape("use_prediction", *f.use_prediction, {f.rows});
+    r.use_prediction = f.use_prediction->data();
   }
 }

@@ -12,9 +12,9 @@ namespace offbeat {
 namespace {
 #include "vector.hpp"
 #include "scan.hpp"
-#include "table.hpp"
+#include "kernels.hpp"
 }  // namespace
 
-extern const Bodies body_avx2;
-constexpr Bodies body_avx2 = {"avx2", table<float>(), table<double>()};
+extern const InstructionSet kernels_avx2;
+constexpr InstructionSet kernels_avx2 = {"avx2", make_kernels<float>(), make_kernels<double>()};
 }  // namespace offbeat

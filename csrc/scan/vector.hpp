@@ -1,8 +1,8 @@
-// Vectors of one instruction set, and the functions of them that a scan needs. Included by a body
-// inside its anonymous namespace, after VECTOR_BYTES is set, so that no other body can link to it.
+// Vectors of one instruction set and the functions of them that the scan uses. Included inside an
+// anonymous namespace, after VECTOR_BYTES is set, so that each instruction set has its own copy.
 //
-// Every operation acts on each lane by itself and in a fixed order. Contraction is off when this is
-// compiled; `fma` is written where it is meant. So a lane gives the same bits wherever it stands.
+// Every operation acts on each lane alone and in a fixed order. The compiler does not contract
+// a * b + c; `fma` is explicit. The result of a lane does not depend on its position.
 
 template <class T>
 struct Lanes;
@@ -138,9 +138,9 @@ INLINE V sigmoid_(V x) {
 
 // Turns 8 rows of 8 floats at `x(i)` into 8 rows at `y(i)`.
 #if defined(__AVX__)
-#define FAST_TURN 1
+#define FAST_TRANSPOSE 1
 template <class X, class Y>
-INLINE void turn_8_by_8(const X& x, const Y& y) {
+INLINE void transpose_8_by_8(const X& x, const Y& y) {
   __m256 r[8], t[8];
   for (int i = 0; i < 8; ++i) r[i] = _mm256_loadu_ps(x(i));
   for (int i = 0; i < 8; i += 2) {
@@ -159,7 +159,7 @@ INLINE void turn_8_by_8(const X& x, const Y& y) {
   }
 }
 #else
-#define FAST_TURN 0
+#define FAST_TRANSPOSE 0
 template <class X, class Y>
-INLINE void turn_8_by_8(const X&, const Y&) {}
+INLINE void transpose_8_by_8(const X&, const Y&) {}
 #endif

@@ -14,8 +14,8 @@ struct TimesTanhSlope {  // that follows from the value of tanh
 
 // y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order.
 template <int NV, bool ACCUMULATE, class Finish>
-static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x, T* y,
-                         int64_t at, const Finish& finish) {
+static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x, T* y, int64_t at,
+                         const Finish& finish) {
   y += at;
   constexpr int W = NV * VW;
   V acc[TILE][NV];
@@ -40,8 +40,8 @@ static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x
         store<T>(y + r * W + v * VW, finish(acc[r][v], at + r * W + v * VW));
 }
 
-// The same for `LANES` lanes of a vector that is mostly empty: vectors over the outputs of N
-// panels, so that lanes which are not there cost nothing. They are set to 0.
+// The same for `LANES` lanes of a vector that is mostly empty: vectors run over the outputs of N
+// panels, so that unused lanes cost nothing. Unused lanes are set to 0.
 template <int LANES, int N, bool ACCUMULATE, class Finish>
 static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y,
                               int64_t at, const Finish& finish) {
@@ -52,8 +52,8 @@ static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const
     for (int lane = 0; lane < LANES; ++lane)
       for (int r = 0; r < TILE; ++r) {
         const int o = n * TILE + r;
-        acc[n][lane][r] = ACCUMULATE ? (o < rows ? y[o * VW + lane] : T(0))
-                                     : (bias ? bias[o] : T(0));
+        acc[n][lane][r] =
+            ACCUMULATE ? (o < rows ? y[o * VW + lane] : T(0)) : (bias ? bias[o] : T(0));
       }
   for (int k = 0; k < in; ++k)
     for (int n = 0; n < N; ++n) {
@@ -75,8 +75,8 @@ static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x,
     few_panels<LANES, N, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, N * TILE, in,
                                      x, y, int64_t(o) * VW, finish);
   for (; o < out; o += TILE)
-    few_panels<LANES, 1, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, out - o, in,
-                                     x, y, int64_t(o) * VW, finish);
+    few_panels<LANES, 1, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, out - o, in, x,
+                                     y, int64_t(o) * VW, finish);
 }
 
 // A policy of lanes: a block of NV vectors of lanes, or the one lane of a stream.
@@ -93,8 +93,7 @@ struct Many {
   // x[k] (+)= sum over o of w[o][k] y[o]
   template <bool ACCUMULATE>
   static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
-    product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
-                        Plain{});
+    product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x, Plain{});
   }
   // The same, times the slope of tanh where its value is `value`.
   static NOINLINE void through_tanh(const Matrix& m, const T* packed, int lanes, const T* y,
@@ -153,12 +152,10 @@ struct One {
                             const T* x, const T* x2, T* y) {
     V acc[N];
     for (int n = 0; n < N; ++n)
-      acc[n] = ACCUMULATE ? load<T>(y + o + n * VW)
-                          : bias ? load<T>(bias + o + n * VW) : splat(0);
+      acc[n] = ACCUMULATE ? load<T>(y + o + n * VW) : bias ? load<T>(bias + o + n * VW) : splat(0);
     for (int k = 0; k < first; ++k) {
       const V xv = splat(x[k]);
-      for (int n = 0; n < N; ++n)
-        acc[n] = fma(load<T>(w + (int64_t(n) * in + k) * VW), xv, acc[n]);
+      for (int n = 0; n < N; ++n) acc[n] = fma(load<T>(w + (int64_t(n) * in + k) * VW), xv, acc[n]);
     }
     for (int k = 0; k < second; ++k) {
       const V xv = splat(x2[k]);
@@ -193,7 +190,6 @@ static NOINLINE void activate(int activation, int units, const T* z, T* value, T
 // to_z = to_value * slope
 template <class P>
 static NOINLINE void activate_backward(int units, const T* slope, const T* to_value, T* to_z) {
-  P::each(units, [&](int64_t i, int) {
-    store<T>(to_z + i, load<T>(to_value + i) * load<T>(slope + i));
-  });
+  P::each(units,
+          [&](int64_t i, int) { store<T>(to_z + i, load<T>(to_value + i) * load<T>(slope + i)); });
 }

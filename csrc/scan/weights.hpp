@@ -1,16 +1,18 @@
 // Sizes of a scan, its matrices, and how their weights are packed: part of Scan<T> (scan.hpp).
 
 struct Dims {
-  int C, H, A, F, ages, I, G, S, D, P;  // channels, hidden, anchored, decay features, ages, cell
-                                        // inputs, gates, state, driven, width of the shown part
+  // Channels, hidden units, anchored channels, decay features, time inputs, cell inputs, gates,
+  // state, driven units (those that the vector field changes).
+  int C, H, A, F, time_inputs, I, G, S, D;
   bool cell, lstm;
 };
 static Dims dims(const Spec& s) {
   Dims d{};
-  d.C = s.channels, d.H = s.hidden, d.A = s.anchored, d.F = s.decay_features, d.ages = s.ages;
+  d.C = s.channels, d.H = s.hidden, d.A = s.anchored, d.F = s.decay_features,
+  d.time_inputs = s.time_inputs;
   d.cell = s.cell != CELL_NONE;
   d.lstm = s.cell == CELL_LSTM;
-  d.I = d.cell ? 2 * d.C + d.ages : 0;
+  d.I = d.cell ? 2 * d.C + d.time_inputs : 0;
   d.G = !d.cell ? 0 : d.H * (s.cell == CELL_GRU ? 3 : d.lstm ? 4 : 1);
   d.S = d.A + d.H + (d.lstm ? d.H : 0);
   d.D = d.A + d.H;
@@ -18,20 +20,28 @@ static Dims dims(const Spec& s) {
 }
 static int up(int n, int m) { return (n + m - 1) / m * m; }
 
-// The matrices, in the order of the flat buffer (offbeat.kernels.fused.pack).
-enum { M_IN, M_REC, M_CAND, M_INNOV, M_DECAY, M_FIELD, M_DECODER = M_FIELD + MAX_LAYERS,
-       M_END = M_DECODER + MAX_LAYERS };
+// The matrices in the order of the flat buffer (offbeat.kernels.spec.ScanWeights.packed).
+enum {
+  M_IN,
+  M_REC,
+  M_CAND,
+  M_INNOV,
+  M_DECAY,
+  M_FIELD,
+  M_DECODER = M_FIELD + MAX_LAYERS,
+  M_END = M_DECODER + MAX_LAYERS
+};
 
 struct Matrix {
   int out = 0, in = 0;
-  int64_t weight = -1, bias = -1;   // in the flat buffer; -1: there is none
+  int64_t weight = -1, bias = -1;  // in the flat buffer; -1: there is none
   bool backward = false;
-  int backward_in = 0;              // leading inputs that a gradient reaches
+  int backward_in = 0;                                  // leading inputs that need a gradient
   int64_t panels = 0, transposed = 0, packed_bias = 0;  // in the packed buffer of batches
-  int64_t sum = 0, bias_sum = 0;    // in the sums of a slot
-  int split[4] = {};                // output rows begin anew at these (streams pad each segment)
+  int64_t sum = 0, bias_sum = 0;                        // in the sums of a slot
+  int split[4] = {};  // output rows begin anew at these (streams pad each segment)
   int splits = 1;
-  int in_split = 0;                 // first part of the inputs (streams pad it)
+  int in_split = 0;  // first part of the inputs (streams pad it)
   int64_t stream_panels = 0, stream_bias = 0;
   int padded_out = 0;
 };
@@ -67,9 +77,9 @@ static NOINLINE Map map(const Spec& s) {
     at += int64_t(out) * in;
     return m;
   };
-  const bool shown_backward = s.input_decay || s.decoder.layers;
+  const bool values_backward = s.input_decay || s.decoder.layers;
   if (d.cell) {
-    Matrix& in = add(M_IN, d.G, d.I, shown_backward, d.C);
+    Matrix& in = add(M_IN, d.G, d.I, values_backward, d.C);
     segments(in, d.G / d.H, d.H);
     in.bias = at, at += d.G;
     if (s.cell == CELL_GRU) {
@@ -96,8 +106,8 @@ static NOINLINE Map map(const Spec& s) {
   for (int k = 0; k < 2; ++k) {
     const Perceptron& net = k ? s.decoder : s.field;
     for (int l = 0; l < net.layers; ++l) {
-      Matrix& m = add((k ? M_DECODER : M_FIELD) + l, net.sizes[l + 1], net.sizes[l], true,
-                      net.sizes[l]);
+      Matrix& m =
+          add((k ? M_DECODER : M_FIELD) + l, net.sizes[l + 1], net.sizes[l], true, net.sizes[l]);
       m.bias = at, at += m.out;
       if (!k && d.A && l == 0) m.in_split = d.A;
       if (!k && d.A && l == net.layers - 1) m.splits = 2, m.split[0] = d.A, m.split[1] = d.H;

@@ -1,18 +1,18 @@
-// What is known of a row, gathered for the lanes of a block, and what is kept of it for the
-// backward pass: part of Scan<T> (scan.hpp).
+// The step inputs of a row, gathered for the lanes of a block, and the layout of the tape: part of
+// Scan<T> (scan.hpp).
 
 // --- between [lane][unit], as callers have it, and [unit][lane] ---------------------------------
 
 // out[unit * W + lane] = lanes[lane][unit]
 static NOINLINE void lanes_to_units(const T* const* lanes, int units, int W, T* out) {
   int first = 0;
-  if constexpr (FAST_TURN && sizeof(T) == 4)
+  if constexpr (FAST_TRANSPOSE && sizeof(T) == 4)
     if (units >= 8 && W % 8 == 0)
       for (; first < units; first += 8) {
         const int u = first + 8 <= units ? first : units - 8;  // the last eight may overlap
         for (int lane = 0; lane < W; lane += 8)
-          turn_8_by_8([&](int i) { return lanes[lane + i] + u; },
-                      [&](int i) { return out + int64_t(u + i) * W + lane; });
+          transpose_8_by_8([&](int i) { return lanes[lane + i] + u; },
+                           [&](int i) { return out + int64_t(u + i) * W + lane; });
       }
   for (int lane = 0; lane < W; ++lane)
     for (int u = first; u < units; ++u) out[int64_t(u) * W + lane] = lanes[lane][u];
@@ -21,12 +21,12 @@ static NOINLINE void lanes_to_units(const T* const* lanes, int units, int W, T* 
 static NOINLINE void units_to_lanes(const T* x, int units, int n, int W, T* const* lanes) {
   for (int lane = 0; lane < n; ++lane) {
     int first = 0;
-    if constexpr (FAST_TURN && sizeof(T) == 4)
+    if constexpr (FAST_TRANSPOSE && sizeof(T) == 4)
       if (units >= 8 && lane + 8 <= n) {
         for (; first < units; first += 8) {
           const int u = first + 8 <= units ? first : units - 8;
-          turn_8_by_8([&](int i) { return x + int64_t(u + i) * W + lane; },
-                      [&](int i) { return lanes[lane + i] + u; });
+          transpose_8_by_8([&](int i) { return x + int64_t(u + i) * W + lane; },
+                           [&](int i) { return lanes[lane + i] + u; });
         }
         lane += 7;
         continue;
@@ -35,7 +35,7 @@ static NOINLINE void units_to_lanes(const T* x, int units, int n, int W, T* cons
   }
 }
 
-// --- what is kept of a row ----------------------------------------------------------------------
+// --- the tape of a row ----------------------------------------------------------------------
 
 // Offsets in units, each to be multiplied by the policy's W. `Net` is one evaluation.
 struct Net {
@@ -53,7 +53,7 @@ static Net net(const Perceptron& shape) {
 }
 template <class P>
 struct Layout {
-  int u, start, end, before, gate, held, innovation, decoded, hidden, carried;
+  int u, start, end, before, gate, inner, innovation, decoded, h_before;
   int decoder, step, step_size, applied, factor, arrived, stage, stage_size, y, network, size;
   Net field_net, decoder_net;
   int x_at, h_at, c_at, state;  // inside a state
@@ -71,13 +71,12 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
   l.c_at = l.h_at + P::pad(d.H);
   l.state = l.c_at + (d.lstm ? P::pad(d.H) : 0);
   l.u = at, at += P::pad(d.I) + (P::ONE ? VW : 0);
-  l.carried = take(s.decoder.layers || d.lstm ? d.H : 0);
+  l.h_before = take(s.decoder.layers ? d.H : 0);
   l.start = take(d.F ? d.H : 0);
   l.end = take(d.F ? d.H : 0);
   l.before = at, at += l.state;
   l.gate = at, at += d.cell ? d.G / d.H * P::pad(d.H) : 0;
-  l.held = take(d.H);
-  l.hidden = take(d.H);
+  l.inner = take(d.H);
   l.innovation = take(d.A);
   l.decoded = take(s.decoder.layers ? d.C : 0);
   l.decoder_net = net<P>(s.decoder);
@@ -104,84 +103,87 @@ static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
   return int64_t(layout<Many<1>>(s, dims(s), max_steps).size) * VW * vectors;
 }
 
-// The facts of one row for the lanes of a block; a lane that has ended stands still.
+// The step inputs of one row for the lanes of a block. A lane past its last row keeps its state.
 template <class P>
-struct Facts {
-  T *gap, *update, *updated, *alive, *values, *mask, *age, *start, *end, *delta, *last;
+struct RowInputs {
+  T *gap, *update, *updated, *valid, *values, *mask, *time_input, *start, *end, *delta, *last;
   const T* mean;
-  T* nothing;  // zeros for a lane that has ended
-  bool active = false, fed = false;
+  T* zeros;  // inputs of a lane past its last row
+  bool active = false, use_prediction = false;
 };
-static constexpr int LANE_FACTS = 4;
-static int facts_size(const Dims& d, int lanes) {
-  return LANE_FACTS * (lanes < VW ? VW : lanes) + (4 * d.C + d.ages + 2 * d.F) * lanes +
-         widest_fact(d);
+static constexpr int ROW_SCALARS = 4;
+static int row_inputs_size(const Dims& d, int lanes) {
+  return ROW_SCALARS * (lanes < VW ? VW : lanes) + (4 * d.C + d.time_inputs + 2 * d.F) * lanes +
+         widest_quantity(d);
 }
-static int widest_fact(const Dims& d) {
-  return up(d.C > d.ages ? (d.C > d.F ? d.C : d.F) : (d.ages > d.F ? d.ages : d.F), 16);
+static int widest_quantity(const Dims& d) {
+  return up(
+      d.C > d.time_inputs ? (d.C > d.F ? d.C : d.F) : (d.time_inputs > d.F ? d.time_inputs : d.F),
+      16);
 }
 template <class P>
-static Facts<P> facts(const Dims& d, T* at) {
-  Facts<P> f{};
-  for (T** p : {&f.gap, &f.update, &f.updated, &f.alive}) *p = at, at += P::W;
+static RowInputs<P> row_inputs(const Dims& d, T* at) {
+  RowInputs<P> f{};
+  for (T** p : {&f.gap, &f.update, &f.updated, &f.valid}) *p = at, at += P::W;
   f.values = at, at += d.C * P::W;
   f.mask = at, at += d.C * P::W;
-  f.age = at, at += d.ages * P::W;
+  f.time_input = at, at += d.time_inputs * P::W;
   f.start = at, at += d.F * P::W;
   f.end = at, at += d.F * P::W;
   f.delta = at, at += d.C * P::W;
   f.last = at, at += d.C * P::W;
-  f.nothing = at;
-  zero(f.nothing, widest_fact(d));
+  f.zeros = at;
+  zero(f.zeros, widest_quantity(d));
   return f;
 }
-// Rows of many trajectories lie far apart: what is needed `ahead` rows on is asked for now.
+// The rows of many trajectories are far apart in memory, so those `ahead` rows on are prefetched.
 template <class P>
 static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, int row,
-                            Facts<P>& f, int ahead) {
+                            RowInputs<P>& f, int ahead) {
   const bool more = row + ahead >= 0 && row + ahead < b.rows;
-  f.fed = job.rows.fed && job.rows.fed[row];
+  f.use_prediction = job.inputs.use_prediction && job.inputs.use_prediction[row];
   f.active = false;
   for (int lane = 0; lane < P::W; ++lane) {
     const int64_t at = lane < b.lanes ? job.source[b.first + lane] : 0;
-    const bool alive = lane < b.lanes && row < job.length[b.first + lane];
-    f.alive[lane] = alive;
-    auto one = [&](const Fact<T>& fact) {
-      return alive && fact.data ? fact.data[at * fact.by_lane + row * fact.by_row] : T(0);
+    const bool valid = lane < b.lanes && row < job.length[b.first + lane];
+    f.valid[lane] = valid;
+    auto one = [&](const Quantity<T>& quantity) {
+      return valid && quantity.data ? quantity.data[at * quantity.by_lane + row * quantity.by_row]
+                                    : T(0);
     };
     if (more && lane < b.lanes)
-      __builtin_prefetch(job.rows.gap.data + at * job.rows.gap.by_lane +
-                         (row + ahead) * job.rows.gap.by_row);
-    f.gap[lane] = one(job.rows.gap);
-    f.update[lane] = one(job.rows.update);
-    f.updated[lane] = one(job.rows.updated);
+      __builtin_prefetch(job.inputs.gap.data + at * job.inputs.gap.by_lane +
+                         (row + ahead) * job.inputs.gap.by_row);
+    f.gap[lane] = one(job.inputs.gap);
+    f.update[lane] = one(job.inputs.update);
+    f.updated[lane] = one(job.inputs.updated);
     f.active |= d.cell && f.update[lane] != 0;
   }
-  auto many = [&](const Fact<T>& fact, int n, T* out) {
-    if (!fact.data || !n) return;
+  auto many = [&](const Quantity<T>& quantity, int n, T* out) {
+    if (!quantity.data || !n) return;
     const T* lanes[P::W];
     for (int lane = 0; lane < P::W; ++lane)
-      lanes[lane] = f.alive[lane] != 0
-                        ? fact.data + int64_t(job.source[b.first + lane]) * fact.by_lane +
-                              row * fact.by_row
-                        : f.nothing;
+      lanes[lane] = f.valid[lane] != 0
+                        ? quantity.data + int64_t(job.source[b.first + lane]) * quantity.by_lane +
+                              row * quantity.by_row
+                        : f.zeros;
     if (more)
       for (int lane = 0; lane < b.lanes; ++lane) {
-        const T* next = fact.data + int64_t(job.source[b.first + lane]) * fact.by_lane +
-                        (row + ahead) * fact.by_row;
+        const T* next = quantity.data + int64_t(job.source[b.first + lane]) * quantity.by_lane +
+                        (row + ahead) * quantity.by_row;
         for (int u = 0; u < n; u += 64 / int(sizeof(T))) __builtin_prefetch(next + u);
         __builtin_prefetch(next + n - 1);
       }
     lanes_to_units(lanes, n, P::W, out);
   };
-  many(job.rows.values, d.C, f.values);
-  many(job.rows.mask, d.C, f.mask);
-  many(job.rows.age, d.ages, f.age);
-  many(job.rows.decay_start, d.F, f.start);
-  many(job.rows.decay_end, d.F, f.end);
-  many(job.rows.delta, d.C, f.delta);
-  many(job.rows.last, d.C, f.last);
-  f.mean = job.rows.mean;
+  many(job.inputs.values, d.C, f.values);
+  many(job.inputs.mask, d.C, f.mask);
+  many(job.inputs.time_input, d.time_inputs, f.time_input);
+  many(job.inputs.decay_start, d.F, f.start);
+  many(job.inputs.decay_end, d.F, f.end);
+  many(job.inputs.delta, d.C, f.delta);
+  many(job.inputs.last, d.C, f.last);
+  f.mean = job.inputs.mean;
 }
 
 static INLINE V clip(V a) {
@@ -199,6 +201,6 @@ struct Context {
   const T* packed;
   const T* input_decay;  // weights, then biases
   Layout<P> l;
-  T* work;               // slopes of the stages, and other scratch
-  int lanes = P::W;      // that there are; the others are padding
+  T* work;           // slopes of the stages, and other scratch
+  int lanes = P::W;  // that there are; the others are padding
 };

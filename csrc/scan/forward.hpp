@@ -2,15 +2,14 @@
 
 template <class P>
 static NOINLINE void evaluate(const Context<P>& c, const Perceptron& shape, int first, const Net& n,
-                     const T* x, T* kept, T* out, T* z) {
+                              const T* x, T* kept, T* out, T* z) {
   for (int l = 0; l < shape.layers; ++l) {
     const Matrix& m = c.map.m[first + l];
     const bool last = l == shape.layers - 1;
     P::template affine<false>(m, c.packed, c.lanes, x, last ? out : z);
     if (last) break;
     T* value = kept + int64_t(n.value[l]) * P::W;
-    activate<P>(shape.activation, shape.sizes[l + 1], z, value,
-                kept + int64_t(n.slope[l]) * P::W);
+    activate<P>(shape.activation, shape.sizes[l + 1], z, value, kept + int64_t(n.slope[l]) * P::W);
     x = value;
   }
 }
@@ -31,7 +30,7 @@ static int steps_of(const Spec& s, const T* gap, T* steps) {
 }
 
 template <class P>
-static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* state, T* tape) {
+static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* state, T* tape) {
   const Spec& s = c.s;
   const Dims& d = c.map.d;
   const Layout<P>& l = c.l;
@@ -41,12 +40,12 @@ static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* stat
   T* memory = state + int64_t(l.c_at) * W;
   T* z = c.work;  // the widest layer fits
 
-  // The cell's input, from the state before the gap where it is fed back.
+  // The cell's input: observed values, faded values, or the decoded state before the gap.
   T* u = at(l.u);
   T* gate = at(l.gate);
   if (f.active) {
-    if (f.fed) {
-      copy<P>(d.H, h, at(l.carried));
+    if (f.use_prediction) {
+      copy<P>(d.H, h, at(l.h_before));
       evaluate<P>(c, s.decoder, M_DECODER, l.decoder_net, h, at(l.decoder), at(l.decoded), z);
       copy<P>(d.C, at(l.decoded), u);
     } else if (s.input_decay) {
@@ -64,11 +63,11 @@ static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* stat
       copy<P>(d.C, f.values, u);
     }
     copy<P>(d.C, f.mask, u + int64_t(d.C) * W);
-    copy<P>(d.ages, f.age, u + int64_t(2 * d.C) * W);
+    copy<P>(d.time_inputs, f.time_input, u + int64_t(2 * d.C) * W);
     P::template affine<false>(c.map.m[M_IN], c.packed, c.lanes, u, gate);
   }
 
-  // Decay and flow.
+  // Decay and dynamics over the gap.
   T* start = at(l.start);
   T* end = at(l.end);
   const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
@@ -76,8 +75,8 @@ static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* stat
     P::template affine<false>(c.map.m[M_DECAY], c.packed, c.lanes, f.start, start);
     P::template affine<false>(c.map.m[M_DECAY], c.packed, c.lanes, f.end, end);
     P::each(d.H, [&](int64_t i, int lane) {
-      const V alive = load<T>(f.alive + lane);
-      V first = load<T>(start + i) * alive, last = load<T>(end + i) * alive;
+      const V valid = load<T>(f.valid + lane);
+      V first = load<T>(start + i) * valid, last = load<T>(end + i) * valid;
       if (s.decay_rows == OBSERVED_ROWS) last = last * load<T>(f.update + lane);
       if (s.decay_rows != CONTINUOUS) first = last;
       store<T>(start + i, first);
@@ -95,27 +94,27 @@ static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* stat
       const T* previous = applied - int64_t(l.step_size) * W;
       P::each(d.H, [&](int64_t i, int lane) {
         const V first = load<T>(start + i), last = load<T>(end + i);
-        V known;
+        V applied_before;
         if (k)
-          known = load<T>(previous + i);
+          applied_before = load<T>(previous + i);
         else if (s.decay_rows != CONTINUOUS)
-          known = splat(0);
+          applied_before = splat(0);
         else
-          known = load<T>(f.updated + lane) != T(0) ? splat(0) : clip(first);
-        V reached = last;
+          applied_before = load<T>(f.updated + lane) != T(0) ? splat(0) : clip(first);
+        V exponent = last;
         if (!one_shot) {
-          V share = T(k + 1) / load<T>(steps + lane);
-          share = share > T(1) ? splat(1) : share;
-          reached = fma(share, last - first, first);
+          V fraction = T(k + 1) / load<T>(steps + lane);
+          fraction = fraction > T(1) ? splat(1) : fraction;
+          exponent = fma(fraction, last - first, first);
         }
-        V grown = clip(reached) - known;
-        if (s.field.layers) grown = grown < T(0) ? splat(0) : grown;
-        const V gamma = exp_(-grown), before = load<T>(h + i);
+        V growth = clip(exponent) - applied_before;
+        if (s.field.layers) growth = growth < T(0) ? splat(0) : growth;
+        const V gamma = exp_(-growth), before = load<T>(h + i);
         store<T>(arrived + i, before);
         store<T>(factor + i, gamma);
         store<T>(h + i, before * gamma);
-        const V bounded = clip(reached);
-        store<T>(applied + i, bounded > known ? bounded : known);
+        const V bounded = clip(exponent);
+        store<T>(applied + i, bounded > applied_before ? bounded : applied_before);
       });
     }
     if (!s.field.layers) break;
@@ -137,7 +136,7 @@ static NOINLINE void row_forward(const Context<P>& c, const Facts<P>& f, T* stat
       store<T>(state + i, m * load<T>(f.values + i) + (1 - m) * load<T>(state + i));
     });
   }
-  cell_forward<P>(c, f, h, memory, gate, at(l.held), at(l.hidden));
+  cell_forward<P>(c, f, h, memory, gate, at(l.inner));
 }
 
 template <class P>
@@ -179,8 +178,8 @@ static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T
 
 // `gate` holds the input's part and becomes the activated gates.
 template <class P>
-static NOINLINE void cell_forward(const Context<P>& c, const Facts<P>& f, T* h, T* memory, T* gate,
-                         T* held, T* hidden) {
+static NOINLINE void cell_forward(const Context<P>& c, const RowInputs<P>& f, T* h, T* memory,
+                                  T* gate, T* inner) {
   const Spec& s = c.s;
   const Dims& d = c.map.d;
   constexpr int W = P::W;
@@ -208,12 +207,12 @@ static NOINLINE void cell_forward(const Context<P>& c, const Facts<P>& f, T* h, 
       const V node = tanh_(load<T>(gate + 2 * n + i));
       const V output = sigmoid_(load<T>(gate + 3 * n + i));
       const V old = load<T>(memory + i);
-      const V fresh = fma(forget, old, insert * node), bent = tanh_(fresh);
+      const V fresh = fma(forget, old, insert * node), squashed = tanh_(fresh);
       store<T>(gate + i, forget), store<T>(gate + n + i, insert);
       store<T>(gate + 2 * n + i, node), store<T>(gate + 3 * n + i, output);
-      store<T>(held + i, bent);
+      store<T>(inner + i, squashed);
       store<T>(memory + i, on * fresh + off * old);
-      store<T>(h + i, on * output * bent + off * load<T>(h + i));
+      store<T>(h + i, on * output * squashed + off * load<T>(h + i));
     });
     return;
   }
@@ -223,18 +222,17 @@ static NOINLINE void cell_forward(const Context<P>& c, const Facts<P>& f, T* h, 
     const V r = sigmoid_(load<T>(gate + n + i));
     store<T>(gate + i, sigmoid_(load<T>(gate + i)));
     store<T>(gate + n + i, r);
-    if (!s.reset_after) store<T>(held + i, r * load<T>(h + i));
+    if (!s.reset_after) store<T>(inner + i, r * load<T>(h + i));
   });
   if (s.reset_after) {
-    P::template affine<false>(c.map.m[M_CAND], c.packed, c.lanes, h, held);
+    P::template affine<false>(c.map.m[M_CAND], c.packed, c.lanes, h, inner);
     P::each(d.H, [&](int64_t i, int) {
       T* g = gate + 2 * n + i;
-      store<T>(g, fma(load<T>(gate + n + i), load<T>(held + i), load<T>(g)));
+      store<T>(g, fma(load<T>(gate + n + i), load<T>(inner + i), load<T>(g)));
     });
   } else {
-    P::template affine<true>(c.map.m[M_CAND], c.packed, c.lanes, held, gate + 2 * n);
+    P::template affine<true>(c.map.m[M_CAND], c.packed, c.lanes, inner, gate + 2 * n);
   }
-  (void)hidden;
   P::each(d.H, [&](int64_t i, int lane) {
     const V candidate = tanh_(load<T>(gate + 2 * n + i)), old = load<T>(h + i);
     store<T>(gate + 2 * n + i, candidate);
@@ -265,7 +263,7 @@ static int64_t work_size(const Spec& s) {
 
 template <class P>
 static NOINLINE void scatter(const Job<T>& job, const Block& b, const Grid<T>& grid, int row,
-                    const T* state, int units) {
+                             const T* state, int units) {
   if (!grid.data) return;
   T* lanes[P::W];
   for (int lane = 0; lane < b.lanes; ++lane)
@@ -297,14 +295,19 @@ static void first_state(const Job<T>& job, const Block& b, T* state) {
 static int64_t forward_scratch(const Spec& s, int max_steps) {
   using P = Many<2>;
   const Dims d = dims(s);
-  return int64_t(d.S) * P::W + facts_size(d, P::W) + work_size<P>(s) +
+  return int64_t(d.S) * P::W + row_inputs_size(d, P::W) + work_size<P>(s) +
          tape_row(s, max_steps, 2) + 64;
 }
 
 template <class P>
 static Context<P> context(const Job<T>& job, const Block& b, const Map& map, T* work) {
-  return Context<P>{*job.spec, map, job.packed, job.packed + map.packed_vectors,
-                    layout<P>(*job.spec, map.d, job.max_steps), work, b.lanes};
+  return Context<P>{*job.spec,
+                    map,
+                    job.packed,
+                    job.packed + map.packed_vectors,
+                    layout<P>(*job.spec, map.d, job.max_steps),
+                    work,
+                    b.lanes};
 }
 
 template <class P>
@@ -313,10 +316,10 @@ static void block_forward(const Job<T>& job, const Block& b, int begin, int end,
   const Dims& d = p.d;
   T* state = scratch;
   T* lanes = state + int64_t(d.S) * P::W;
-  T* work = lanes + facts_size(d, P::W);
+  T* work = lanes + row_inputs_size(d, P::W);
   T* own = work + work_size<P>(*job.spec);
   const Context<P> c = context<P>(job, b, p, work);
-  Facts<P> f = facts<P>(d, lanes);
+  RowInputs<P> f = row_inputs<P>(d, lanes);
   const int64_t row_size = int64_t(c.l.size) * P::W;
   if (begin)
     collect<P>(job, b, job.after, begin - 1, d.S, false, state);

@@ -12,9 +12,9 @@ namespace offbeat {
 namespace {
 #include "vector.hpp"
 #include "scan.hpp"
-#include "table.hpp"
+#include "kernels.hpp"
 }  // namespace
 
-extern const Bodies body_avx512;
-constexpr Bodies body_avx512 = {"avx512", table<float>(), table<double>()};
+extern const InstructionSet kernels_avx512;
+constexpr InstructionSet kernels_avx512 = {"avx512", make_kernels<float>(), make_kernels<double>()};
 }  // namespace offbeat

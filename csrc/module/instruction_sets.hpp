@@ -1,0 +1,41 @@
+// The bodies that this processor can run: part of module.cpp.
+
+std::vector<const InstructionSet*> runnable() {
+  std::vector<const InstructionSet*> found;
+#ifdef OFFBEAT_X86
+  __builtin_cpu_init();
+  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
+      __builtin_cpu_supports("avx512dq"))
+    found.push_back(&kernels_avx512);
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+    found.push_back(&kernels_avx2);
+#endif
+  found.push_back(&kernels_baseline);
+  return found;
+}
+
+const std::vector<const InstructionSet*>& instruction_sets() {
+  static const std::vector<const InstructionSet*> all = runnable();
+  return all;
+}
+
+const InstructionSet& find_instruction_set(const std::string& name) {
+  std::string names;
+  for (const InstructionSet* b : instruction_sets()) {
+    if (name == b->name) return *b;
+    names += std::string(names.empty() ? "" : ", ") + b->name;
+  }
+  throw nb::value_error(
+      ("this processor does not run the instruction set '" + name + "', it runs " + names).c_str());
+}
+
+template <class T>
+const Kernels<T>& typed(const InstructionSet& b);
+template <>
+const Kernels<float>& typed(const InstructionSet& b) {
+  return b.f32;
+}
+template <>
+const Kernels<double>& typed(const InstructionSet& b) {
+  return b.f64;
+}

@@ -1,0 +1,240 @@
+// Streaming inference: part of module.cpp. One trajectory, one row at a time, in buffers that are
+// allocated once. The step inputs and the scaling of an anchored state, which PyTorch computes for
+// a batch, are computed here for one row by the same operations in the same order, so that the bits
+// are equal.
+
+enum TimeInput { TIME_INPUT_NONE, TIME_INPUT_ELAPSED, TIME_INPUT_GAP, TIME_INPUT_DELTA };
+
+struct TimeSettings {  // how a model reads time; units and limits in s
+  double unit = 1, time_input_unit = 1, elapsed_limit = 1, longest_delta = 1;
+  int time_input = TIME_INPUT_NONE;
+  bool from_first_row = false, last_row = false, every_row = false, starts_only = false;
+  bool exponential = false;  // the decay depends on the elapsed time, not on delta
+};
+
+template <class T>
+class StreamEngine {
+ public:
+  StreamEngine(const Spec& spec, const std::string& set, const Const<T>& weights,
+               const Const<T>& mean, const Const<T>& std, const std::vector<int>& decoder,
+               const Maybe<T>& decoder_weights, const Const<T>& first_state,
+               const TimeSettings& settings)
+      : spec_(spec),
+        kernels_(typed<T>(find_instruction_set(set))),
+        time_(settings),
+        packed_(kernels_.stream_packed_size(spec)),
+        scratch_(kernels_.stream_scratch(spec)),
+        decoder_(perceptron_of(decoder, TANH)),
+        decoder_packed_(decoder.empty() ? 1 : kernels_.stream_perceptron_size(decoder_)),
+        decoder_scratch_(decoder.empty() ? 1 : kernels_.stream_perceptron_scratch(decoder_)) {
+    const int C = spec.channels, S = state_of(spec);
+    check_shape("weights", weights, {flat_size(spec)});
+    check_shape("mean", mean, {C});
+    check_shape("std", std, {C});
+    check_shape("first_state", first_state, {S});
+    kernels_.stream_pack(spec_, weights.data(), packed_.get());
+    if (decoder_.layers) {
+      if (!decoder_weights) refuse("decoder_weights is missing; this model has a decoder");
+      check_shape("decoder_weights", *decoder_weights, {perceptron_flat(decoder_)});
+      kernels_.stream_perceptron_pack(decoder_, decoder_weights->data(), decoder_packed_.get());
+      if (decoder_.sizes[0] != spec.hidden || decoder_.sizes[decoder_.layers] != C)
+        refuse("the decoder does not fit the model");
+    }
+    mean_.assign(mean.data(), mean.data() + C);
+    std_.assign(std.data(), std.data() + C);
+    first_.state.assign(first_state.data(), first_state.data() + S);
+    first_.last = mean_;
+    first_.channel_at.assign(C, -INFINITY);
+    now_ = first_;
+    for (std::vector<T>* v : {&values_, &mask_, &delta_, &last_, &start_, &end_})
+      v->assign(C, T(0));
+    time_input_.assign(std::max(spec.time_inputs, 1), T(0));
+    before_.assign(S, T(0));
+    after_.assign(S, T(0));
+    out_.assign(std::max(C, 1), T(0));
+  }
+
+  void reset() { now_ = first_; }
+
+  void observe(double time, const Const<T>& values, const Const<bool>& mask, bool use_prediction) {
+    check_shape("values", values, {spec_.channels});
+    check_shape("mask", mask, {spec_.channels});
+    run(time, values.data(), mask.data(), use_prediction);
+    now_.state.swap(after_);
+    now_.time = time;
+    now_.start = next_start_;
+    if (observed_) now_.observed_at = time;
+    for (int c = 0; c < spec_.channels; ++c)
+      if (mask.data()[c]) now_.channel_at[c] = time, now_.last[c] = values.data()[c];
+    now_.updated = update_;
+    ++now_.rows;
+  }
+
+  void predict(const Const<double>& times, Array<double> out) {
+    const int64_t n = times.ndim() == 1 ? int64_t(times.shape(0)) : 0;
+    check_shape("times", times, {n});
+    check_shape("out", out, {n, spec_.channels});
+    check_contiguous("out", out);
+    for (int64_t i = 0; i < n; ++i) {
+      const T* state = now_.state.data();
+      if (!time_.last_row) {
+        run(times.data()[i], nullptr, nullptr, false);
+        state = before_.data();
+      }
+      read(state, out.data() + i * spec_.channels);
+    }
+  }
+
+  void reserve(int slots) { slots_.assign(slots, first_); }
+  void save(int slot) { slots_.at(slot) = now_; }
+  void load(int slot) { now_ = slots_.at(slot); }
+
+  // state, time, start, observed_at, channel_at, last, updated, rows: exact as doubles.
+  int64_t size() const { return int64_t(now_.state.size()) + 2 * spec_.channels + 5; }
+  void export_to(Array<double> out) const {
+    check_shape("out", out, {size()});
+    double* p = out.data();
+    for (T v : now_.state) *p++ = v;
+    *p++ = now_.time, *p++ = now_.start, *p++ = now_.observed_at;
+    for (double v : now_.channel_at) *p++ = v;
+    for (T v : now_.last) *p++ = v;
+    *p++ = now_.updated, *p++ = double(now_.rows);
+  }
+  void restore(const Const<double>& in) {
+    check_shape("state", in, {size()});
+    const double* p = in.data();
+    for (T& v : now_.state) v = T(*p++);
+    now_.time = *p++, now_.start = *p++, now_.observed_at = *p++;
+    for (double& v : now_.channel_at) v = *p++;
+    for (T& v : now_.last) v = T(*p++);
+    now_.updated = *p++ != 0, now_.rows = int64_t(*p++);
+  }
+  int64_t rows() const { return now_.rows; }
+
+ private:
+  struct State {
+    std::vector<T> state, last;
+    std::vector<double> channel_at;
+    double time = NAN, start = INFINITY, observed_at = -INFINITY;
+    bool updated = false;
+    int64_t rows = 0;
+  };
+
+  // Computes the state before and after a row, in before_ and after_.
+  void run(double time, const T* values, const bool* mask, bool use_prediction) {
+    const int C = spec_.channels;
+    observed_ = false;
+    for (int c = 0; c < C; ++c) {
+      const bool on = mask && mask[c];
+      observed_ |= on;
+      mask_[c] = on;
+      values_[c] = !on ? T(0) : spec_.anchored ? (values[c] - mean_[c]) / std_[c] : values[c];
+    }
+    const double before = std::isnan(now_.time) ? time : now_.time;
+    const bool starts = time_.from_first_row || observed_;
+    next_start_ = std::min(now_.start, starts ? time : INFINITY);
+    const double clock = std::max(now_.observed_at, next_start_);
+    const double past = std::max(time - clock, 0.0), past_before = std::max(before - clock, 0.0);
+    const double elapsed = std::min(past, time_.elapsed_limit);
+    const double elapsed_before = std::min(past_before, time_.elapsed_limit);
+    const double lost = past - elapsed, lost_before = past_before - elapsed_before;
+    update_ = time_.starts_only ? observed_ && std::isinf(now_.observed_at)
+              : time_.every_row ? true
+                                : observed_;
+    if (spec_.decay_features || spec_.input_decay || time_.time_input == TIME_INPUT_DELTA) {
+      for (int c = 0; c < C; ++c) {
+        const double channel_clock = std::max(now_.channel_at[c], next_start_);
+        const double delta = std::max(time - lost - channel_clock, 0.0);
+        const double delta_before = std::max((before - lost_before) - channel_clock, 0.0);
+        delta_[c] = T(delta / time_.unit);
+        if (!time_.exponential) start_[c] = T(delta_before / time_.unit), end_[c] = delta_[c];
+        if (time_.time_input == TIME_INPUT_DELTA)
+          time_input_[c] = T(std::min(delta, time_.longest_delta) / time_.time_input_unit);
+      }
+    }
+    if (time_.exponential)
+      start_[0] = T(elapsed_before / time_.unit), end_[0] = T(elapsed / time_.unit);
+    if (time_.time_input == TIME_INPUT_ELAPSED) time_input_[0] = T(elapsed / time_.time_input_unit);
+    if (time_.time_input == TIME_INPUT_GAP)
+      time_input_[0] = T((time - before) / time_.time_input_unit);
+
+    StreamRow<T> row;
+    row.spec = &spec_;
+    row.packed = packed_.get();
+    row.gap = T((elapsed - elapsed_before) / time_.unit);
+    row.update = update_;
+    row.updated = now_.updated;
+    row.values = values_.data(), row.mask = mask_.data(), row.time_input = time_input_.data();
+    row.decay_start = start_.data(), row.decay_end = end_.data();
+    row.delta = delta_.data(), row.last = now_.last.data(), row.mean = mean_.data();
+    row.use_prediction = use_prediction;
+    row.state = now_.state.data(), row.before = before_.data(), row.after = after_.data();
+    row.scratch = scratch_.get();
+    kernels_.stream_row(row);
+  }
+
+  void read(const T* state, double* out) {
+    if (decoder_.layers) {
+      kernels_.stream_perceptron(decoder_, decoder_packed_.get(), state, out_.data(),
+                                 decoder_scratch_.get());
+      for (int c = 0; c < spec_.channels; ++c) out[c] = out_[c];
+      return;
+    }
+    for (int c = 0; c < spec_.channels; ++c) {
+      const T scaled = state[c] * std_[c];
+      out[c] = scaled + mean_[c];
+    }
+  }
+
+  Spec spec_;
+  const Kernels<T>& kernels_;
+  TimeSettings time_;
+  Buffer<T> packed_, scratch_;
+  Perceptron decoder_;
+  Buffer<T> decoder_packed_, decoder_scratch_;
+  std::vector<T> mean_, std_, values_, mask_, delta_, last_, start_, end_, time_input_, before_,
+      after_, out_;
+  State first_, now_;
+  std::vector<State> slots_;
+  bool observed_ = false, update_ = false;
+  double next_start_ = 0;
+};
+
+template <class T>
+void bind_stream(nb::module_& m, const std::string& suffix) {
+  nb::class_<StreamEngine<T>>(m, ("StreamEngine_" + suffix).c_str())
+      .def(
+          "__init__",
+          [](StreamEngine<T>* self, const Spec& spec, const std::string& set, Const<T> weights,
+             Const<T> mean, Const<T> std, const std::vector<int>& decoder, Maybe<T> decoder_weights,
+             Const<T> first_state, double unit, double time_input_unit, double elapsed_limit,
+             double longest_delta, int time_input, bool from_first_row, bool last_row,
+             bool every_row, bool starts_only, bool exponential) {
+            TimeSettings c;
+            c.unit = unit, c.time_input_unit = time_input_unit, c.elapsed_limit = elapsed_limit;
+            c.longest_delta = longest_delta, c.time_input = time_input,
+            c.from_first_row = from_first_row;
+            c.last_row = last_row, c.every_row = every_row, c.starts_only = starts_only;
+            c.exponential = exponential;
+            new (self) StreamEngine<T>(spec, set, weights, mean, std, decoder, decoder_weights,
+                                       first_state, c);
+          },
+          nb::arg("spec"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
+          nb::arg("mean").noconvert(), nb::arg("std").noconvert(), nb::arg("decoder"),
+          nb::arg("decoder_weights").noconvert().none(), nb::arg("first_state").noconvert(),
+          nb::arg("unit"), nb::arg("time_input_unit"), nb::arg("elapsed_limit"),
+          nb::arg("longest_delta"), nb::arg("time_input"), nb::arg("from_first_row"),
+          nb::arg("last_row"), nb::arg("every_row"), nb::arg("starts_only"), nb::arg("exponential"))
+      .def("reset", &StreamEngine<T>::reset)
+      .def("observe", &StreamEngine<T>::observe, nb::arg("time"), nb::arg("values").noconvert(),
+           nb::arg("mask").noconvert(), nb::arg("use_prediction"))
+      .def("predict", &StreamEngine<T>::predict, nb::arg("times").noconvert(),
+           nb::arg("out").noconvert())
+      .def("reserve", &StreamEngine<T>::reserve, nb::arg("slots"))
+      .def("save", &StreamEngine<T>::save, nb::arg("slot"))
+      .def("load", &StreamEngine<T>::load, nb::arg("slot"))
+      .def("export_to", &StreamEngine<T>::export_to, nb::arg("out").noconvert())
+      .def("restore", &StreamEngine<T>::restore, nb::arg("state").noconvert())
+      .def_prop_ro("size", &StreamEngine<T>::size)
+      .def_prop_ro("rows", &StreamEngine<T>::rows);
+}
