@@ -38,6 +38,35 @@ def same(got, expected):
     return np.array_equal(got, np.array(expected, dtype=float), equal_nan=True)
 
 
+class TestRoles:
+    def test_options_give_channels_their_roles(self):
+        logged = signal([0, 10], [1.0, 2.0], [3.0, 4.0], [5.0, 6.0])
+        dataset = built(logged, actions=["y"], exogenous=["z"])
+        assert dataset.roles == ("state", "action", "exogenous")
+        assert built(logged, actions=["y"], channels=["y", "x"]).roles == ("action", "state")
+        with pytest.raises(InputError, match=r"unknown channel in actions 'u', expected one of: x"):
+            built(logged, actions=["u"])
+
+    def test_an_action_holds_until_the_next_one_also_between_its_own_stamps(self):
+        state = signal([0, 10, 20, 30], [0.0, 1.0, 2.0, 3.0], name="arm")
+        command = signal([5, 20], [7.0, 8.0], name="cmd", roles=("action",))
+        dataset = built(state, command)
+        assert dataset[0].times.tolist() == [0.0, 0.005, 0.01, 0.02, 0.03]
+        assert dataset[0].actions[:, 0].tolist() == [7.0, 7.0, 7.0, 8.0, 8.0]
+        resampled = built(state, command, resample_hz=200)[0]
+        assert resampled.actions[:, 0].tolist() == [7.0, 7.0, 7.0, 7.0, 8.0, 8.0, 8.0]
+
+    def test_the_values_of_an_action_stay_what_was_commanded(self):
+        repeated = np.repeat(np.arange(20.0), 5)
+        stamps = 10 * np.arange(100)
+        logged = signal(stamps, repeated, repeated, roles=("state", "action"))
+        dataset = built(logged, held="mask")
+        assert dataset[0].observed.sum(axis=0).tolist() == [20, 100]
+        flips = np.resize([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]], (8, 4))
+        q = signal(10 * np.arange(8), *flips.T, channels=("qw", "qx", "qy", "qz"))
+        assert same(built(q, actions=q.channels)[0].values, flips)
+
+
 class TestOrder:
     def test_late_rows_are_sorted_in_and_counted(self):
         dataset = built(signal([0, 20, 10, 30], [0.0, 2.0, 1.0, 3.0]))
@@ -495,7 +524,7 @@ def test_policies_that_are_none_are_refused(options, message):
     [
         ({"stamps": np.zeros(2)}, "stamps must be int64 nanoseconds"),
         ({"values": np.zeros((3, 1))}, r"float64 of shape \(2, 1\)"),
-        ({"units": ("m", "m")}, "got 2 units and 1 kinds for 1 channels"),
+        ({"units": ("m", "m")}, "got 2 units, 1 kinds and 1 roles for 1 channels"),
         ({"kinds": ("turn",)}, "unknown kind of channel 'turn'"),
         ({"kinds": ("quaternion",)}, "four in a row make one"),
     ],

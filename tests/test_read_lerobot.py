@@ -44,12 +44,12 @@ class TestADataSet:
     def test_gives_states_and_actions_of_every_episode(self, write):
         dataset = read(write())
         assert [t.rows for t in dataset] == list(LENGTHS)
-        assert dataset.names == ("hip", "knee", "ankle")
-        assert dataset.meta["actions"] == ["left", "right"]
+        assert dataset.names == ("hip", "knee", "ankle", "action.left", "action.right")
+        assert dataset.roles == ("state",) * 3 + ("action",) * 2
         assert dataset.meta["labels"] == ["0", "1", "2"]
         for i, trajectory in enumerate(dataset):
             expected = logs.lerobot_episode(i, LENGTHS[i])
-            assert np.array_equal(trajectory.values, expected["observation.state"])
+            assert np.array_equal(trajectory.values[:, :3], expected["observation.state"])
             assert np.array_equal(trajectory.actions, expected["action"])
 
     def test_that_does_not_fit_into_memory_is_refused_before_it_is_read(self, write, monkeypatch):
@@ -72,7 +72,7 @@ class TestADataSet:
         dataset = read(write(episodes, features=features))
         assert dataset[0].times.tolist() == [0.0, 8e-9, 18e-9, 30e-9]
         assert dataset.meta["report"]["notes"][0] == "stamps are the column 'observation.time_ns'"
-        assert dataset.names == ("hip", "knee", "ankle")
+        assert dataset.names[:3] == ("hip", "knee", "ankle")
 
     def test_takes_stamps_that_jitter_in_the_usual_column(self, write):
         jitter = np.array([0.0, 0.004, -0.003, 0.002])
@@ -90,13 +90,16 @@ class TestADataSet:
     def test_gives_the_columns_and_episodes_that_are_asked_for(self, write):
         path = write()
         dataset = read(path, columns=["next.reward", "observation.state"], episodes=[2, 0])
-        assert dataset.names == (
+        assert dataset.names[:4] == (
             "next.reward", "observation.state.hip", "observation.state.knee",
             "observation.state.ankle",
         )  # fmt: skip
         assert [t.rows for t in dataset] == [4, 5]
         assert [t.rows for t in read(path, columns="observation.state", episodes=1)] == [7]
+        assert read(path, include_actions=False)[0].actions is None
+        # As 0.1.0 called it.
         assert read(path, actions=False)[0].actions is None
+        assert read(path, columns=["action"])[0].channels == 2
         assert read(path, time_column="timestamp")[0].times[1] == pytest.approx(0.05)
 
     def test_lists_what_there_is(self, write):
@@ -140,7 +143,7 @@ class TestADataSet:
     def test_names_channels_as_its_info_does_in_whatever_form(self, write, names, expected):
         state = {"dtype": "float32", "shape": [3], "names": names}
         features = logs.FEATURES | {"observation.state": state}
-        assert read(write(features=features)).names == expected
+        assert read(write(features=features)).names[:3] == expected
 
 
 class TestDamage:
@@ -209,22 +212,22 @@ class TestDamage:
 def test_a_set_of_a_real_robot_is_read():
     path = shared("unitree_g1_lerobot_v21")
     dataset = read(path)
-    assert (len(dataset), dataset.channels) == (100, 26)
+    assert (len(dataset), dataset.roles.count("state")) == (100, 26)
     assert sum(t.rows for t in dataset) == 35_965
     assert dataset.names[0] == "kLeftShoulderPitch"
     table = pq.read_table(path / "data/chunk-000/episode_000042.parquet")
     state = np.array(table.column("observation.state").to_pylist())
-    assert np.array_equal(dataset[42].values, state)
+    assert np.array_equal(dataset[42].values[:, :26], state)
     assert np.array_equal(dataset[42].actions, np.array(table.column("action").to_pylist()))
 
 
 def test_a_set_that_lerobot_wrote_itself_is_read():
     rng = np.random.default_rng(0)  # tests/data/README.md
     dataset = read(ROOT / "tests" / "data" / "lerobot_v3")
-    assert (dataset.names, dataset.meta["actions"]) == (("hip", "knee", "ankle"), ["left", "right"])
+    assert dataset.names == ("hip", "knee", "ankle", "action.left", "action.right")
     assert [t.rows for t in dataset] == [6, 9]
     for trajectory in dataset:
         for values, actions in zip(trajectory.values, trajectory.actions, strict=True):
-            assert values.tolist() == rng.normal(size=3).astype(np.float32).tolist()
+            assert values[:3].tolist() == rng.normal(size=3).astype(np.float32).tolist()
             assert actions.tolist() == rng.normal(size=2).astype(np.float32).tolist()
     assert dataset[1].times.tolist() == (np.arange(9) / 10).tolist()

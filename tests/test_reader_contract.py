@@ -43,9 +43,13 @@ def read_back(variant, path, **options):
 
 
 def walk_of(dataset):
-    """The columns of the walk: the two channels that are no constants."""
+    """The columns of the walk: the two states that are no constants."""
     (trajectory,) = dataset
-    moving = [c for c in range(dataset.channels) if np.nanstd(trajectory.values[:, c]) > 0]
+    moving = [
+        c
+        for c, role in enumerate(dataset.roles)
+        if role == "state" and np.nanstd(trajectory.values[:, c]) > 0
+    ]
     return trajectory.values[:, moving]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 from offbeat.data import store
 from offbeat.data.schema import METADATA_KEY, SCHEMA_VERSION
 from offbeat.data.store import holds_data_set, load, save
-from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.trajectory import ROLES, Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError
 
 FLOATS = st.floats(allow_nan=True, allow_infinity=False)
@@ -37,24 +38,21 @@ def datasets(draw):
     free = text.filter(lambda name: name != "time" and "|" not in name)
     names = draw(st.lists(free, min_size=channels, max_size=channels, unique=True))
     units = draw(st.lists(text, min_size=channels, max_size=channels))
-    actions = draw(st.none() | st.integers(0, 2))
+    roles = draw(st.lists(st.sampled_from(ROLES), min_size=channels, max_size=channels))
     trajectories = []
     for _ in range(draw(st.integers(1, 4))):
         times = draw(st.lists(FLOATS.filter(lambda x: x == x), min_size=1, max_size=5, unique=True))
         shape = (len(times), channels)
         values = draw(hnp.arrays(np.float64, shape, elements=FLOATS))
         seen = draw(hnp.arrays(np.bool_, shape))
-        finite = st.floats(allow_nan=False, allow_infinity=False)
         trajectories.append(
             Trajectory(
                 np.sort(times),
                 values,
                 observed=seen & ~np.isnan(values) if draw(st.booleans()) else None,
-                actions=None
-                if actions is None
-                else draw(hnp.arrays(np.float64, (len(times), actions), elements=finite)),
                 names=names,
                 units=units,
+                roles=roles,
                 origin=draw(text),
             )
         )
@@ -65,18 +63,14 @@ def assert_identical(got: Dataset, expected: Dataset) -> None:
     assert got.meta == expected.meta
     assert len(got) == len(expected)
     for a, b in zip(got, expected, strict=True):
-        assert (a.names, a.units, a.origin) == (b.names, b.units, b.origin)
+        assert (a.names, a.units, a.roles, a.origin) == (b.names, b.units, b.roles, b.origin)
         assert a.times.tobytes() == b.times.tobytes()
         assert a.values.tobytes() == b.values.tobytes()
         assert a.observed.tobytes() == b.observed.tobytes()
-        assert (a.actions is None) == (b.actions is None)
-        if a.actions is not None and b.actions is not None:
-            assert a.actions.shape == b.actions.shape
-            assert a.actions.tobytes() == b.actions.tobytes()
 
 
 def example() -> Dataset:
-    """Two trajectories of unlike length, a channel never known, hidden cells, actions."""
+    """Two trajectories of unlike length, a channel never known, a masked value, an action."""
     random = np.random.default_rng(0)
     trajectories = []
     for i, rows in enumerate((5, 3)):
@@ -89,9 +83,9 @@ def example() -> Dataset:
                 np.cumsum(random.random(rows)),
                 values,
                 observed=observed,
-                actions=random.normal(size=(rows, 2)),
                 names=("hip", "knee", "foot"),
                 units=("rad", "rad", "N"),
+                roles=("state", "action", "exogenous"),
                 origin=f"walk {i}",
             )
         )
@@ -135,9 +129,7 @@ def test_many_row_groups_give_the_same_data_set(monkeypatch, tmp_path):
 
 def test_the_columns_can_be_read_by_any_parquet_library(path):
     table = pq.read_table(path)
-    assert table.column_names == [
-        *("trajectory", "time", "hip", "knee", "foot", "hip|observed", "action|0", "action|1")
-    ]
+    assert table.column_names == [*("trajectory", "time", "hip", "knee", "foot", "hip|observed")]
     assert table.column("trajectory").to_pylist() == [0] * 5 + [1] * 3
     assert table.column("hip|observed").to_pylist()[:3] == [True, False, True]
 
@@ -192,7 +184,7 @@ def test_meta_that_json_would_change_is_refused(meta, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["time", "trajectory", "knee|observed", "action|1"])
+@pytest.mark.parametrize("name", ["time", "trajectory", "knee|observed"])
 def test_a_channel_named_as_another_column_is_refused(name, tmp_path):
     def hides(t):
         return replace(t, names=(name, "knee", "foot"), observed=np.zeros_like(t.observed))
@@ -201,10 +193,38 @@ def test_a_channel_named_as_another_column_is_refused(name, tmp_path):
         save(Dataset([hides(t) for t in example()]), tmp_path / "walk.parquet")
 
 
-def test_trajectories_of_unlike_actions_are_refused(tmp_path):
-    first, second = example()
-    with pytest.raises(InputError, match="trajectory 1 has 0 actions, the first one has 2"):
-        save(Dataset([first, replace(second, actions=None)]), tmp_path / "walk.parquet")
+def test_a_data_set_of_offbeat_0_1_0_is_loaded_with_its_actions_as_channels(tmp_path):
+    schema = {
+        "version": 1, "rows": 3, "trajectories": 2, "names": ["hip", "knee"], "units": ["rad", ""],
+        "observed": ["knee"], "actions": 2, "origins": ["a", "b"],
+        "meta": {"seed": 1, "actions": ["left", "right"]},
+    }  # fmt: skip
+    table = pa.table(
+        {
+            "trajectory": pa.array([0, 0, 1], pa.int32()),
+            "time": [0.0, 0.1, 0.0],
+            "hip": [1.0, 2.0, 3.0],
+            "knee": [4.0, 5.0, 6.0],
+            "knee|observed": [True, False, True],
+            "action|0": [0.1, 0.2, 0.3],
+            "action|1": [0.4, 0.5, 0.6],
+        }
+    )
+    path = tmp_path / "old.parquet"
+    pq.write_table(table.replace_schema_metadata({"offbeat": json.dumps(schema)}), path)
+    dataset = load(path)
+    assert dataset.names == ("hip", "knee", "left", "right")
+    assert dataset.roles == ("state", "state", "action", "action")
+    assert dataset.units == ("rad", "", "", "")
+    assert dataset[0].actions.tolist() == [[0.1, 0.4], [0.2, 0.5]]
+    assert dataset[0].observed[:, 1].tolist() == [True, False]
+    assert dataset.meta == {"seed": 1}
+    # What 0.1.0 gave for the same data, by its definition.
+    digest = hashlib.sha256(b"hip\0knee")
+    for t in dataset:
+        for array in (t.times, t.values[:, :2].copy(), t.observed[:, :2].copy()):
+            digest.update(array.tobytes())
+    assert dataset.fingerprint(version=1) == digest.hexdigest()
 
 
 class TestAFileThatIsNoDataSet:
@@ -299,7 +319,7 @@ class TestAFileThatIsNoDataSet:
         def nameless(table):
             return table.set_column(0, "trajectory", pa.nulls(len(table), pa.int32()))
 
-        self.refused(rewritten(path, nameless), "empty cells in column 'trajectory'")
+        self.refused(rewritten(path, nameless), "empty values in column 'trajectory'")
 
     def test_is_refused_when_its_times_do_not_increase(self, path):
         def stopped(table):

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import offbeat as ob
+from offbeat.data.arrays import owned
 
 TIMES = np.array([0.0, 0.1, 0.3])
 VALUES = np.array([[1.0, 2.0], [np.nan, 3.0], [4.0, np.nan]])
@@ -46,10 +47,10 @@ def test_a_trajectory_cannot_be_changed():
         ({"observed": np.ones((3, 2), bool)}, "True at row 1, channel 'channel_0', where the"),
         ({"observed": np.ones((3, 2))}, "observed must be bool"),
         ({"names": ("a", "a")}, "'a' stands twice"),
-        ({"names": ("a",)}, "1 names and 1 units for 2 channels"),
-        ({"units": ("m",)}, "2 names and 1 units"),
-        ({"actions": np.zeros((2, 1))}, r"actions must have shape \(3, actions\)"),
-        ({"actions": np.full((3, 1), np.nan)}, "actions are not finite at row 0"),
+        ({"names": ("a",)}, "1 names, 2 units and 2 roles for 2 channels"),
+        ({"units": ("m",)}, "2 names, 1 units"),
+        ({"roles": ("state",)}, "2 units and 1 roles"),
+        ({"roles": ("state", "control")}, "unknown role of a channel 'control'.* exogenous, state"),
     ],
 )
 def test_what_is_wrong_is_said_with_what_was_got_and_where(fields, message):
@@ -81,12 +82,15 @@ def test_an_unknown_unit_of_time_is_refused_with_the_choices():
         ob.Trajectory.from_arrays(TIMES, VALUES, time_unit="sec")
 
 
-def test_a_data_set_holds_trajectories_of_the_same_channels_and_actions():
+def test_a_data_set_holds_trajectories_of_the_same_channels():
     one = ob.Trajectory(TIMES, VALUES, names=("a", "b"))
     for other, message in (
         (ob.Trajectory(TIMES, VALUES), "trajectory 1 has channels channel_0"),
         (ob.Trajectory(TIMES, VALUES, names=("a", "b"), units=("m", "")), r"a \[m\]"),
-        (ob.Trajectory(TIMES, VALUES, names=("a", "b"), actions=np.zeros((3, 2))), "2 actions"),
+        (
+            ob.Trajectory(TIMES, VALUES, names=("a", "b"), roles=("state", "action")),
+            r"b \[\] \(action\)",
+        ),
     ):
         with pytest.raises(ob.InputError, match=message):
             ob.Dataset((one, other))
@@ -95,23 +99,62 @@ def test_a_data_set_holds_trajectories_of_the_same_channels_and_actions():
 
 
 def test_a_data_set_is_sliced_chosen_from_and_reordered():
+    roles = ("state", "action")
     many = ob.Dataset(
-        tuple(ob.Trajectory(TIMES, VALUES + i, names=("a", "b")) for i in range(4)), {"seed": 1}
+        tuple(ob.Trajectory(TIMES, VALUES + i, names=("a", "b"), roles=roles) for i in range(4)),
+        {"seed": 1},
     )
     assert len(many[1:3]) == 2
     assert many[1:3].meta == {"seed": 1}
     assert [float(t.values[0, 0]) for t in many.take([3, 0])] == [4.0, 1.0]
     swapped = many.select(("b", "a"))
-    assert swapped.names == ("b", "a")
+    assert (swapped.names, swapped.roles) == (("b", "a"), ("action", "state"))
+    assert many.take([2]).roles == many[0].slice(0, 1).roles == roles
+    assert np.array_equal(many[0].actions, VALUES[:, 1:], equal_nan=True)
+    assert many.select(("a",))[0].actions is None
     assert np.array_equal(swapped[0].values, VALUES[:, ::-1], equal_nan=True)
     with pytest.raises(ob.InputError, match="unknown channel 'c'"):
         many.select(("c",))
 
 
 def test_fingerprints_are_equal_for_equal_data_alone():
-    def made(values=VALUES, times=TIMES, observed=None):
-        return ob.Dataset((ob.Trajectory(times, values, observed),)).fingerprint()
+    def made(values=VALUES, times=TIMES, **fields):
+        return ob.Dataset((ob.Trajectory(times, values, **fields),))
 
-    assert made() == made()
-    hidden = ~np.isnan(VALUES) & np.array([[True, False]] * 3)
-    assert len({made(), made(VALUES * 2), made(times=TIMES * 2), made(observed=hidden)}) == 4
+    masked = ~np.isnan(VALUES) & np.array([[True, False]] * 3)
+    others = [
+        made(VALUES * 2),
+        made(times=TIMES * 2),
+        made(observed=masked),
+        made(names=("a", "b")),
+        made(units=("m", "")),
+        made(units=("", "m")),
+        made(roles=("state", "action")),
+        made(roles=("state", "exogenous")),
+    ]
+    assert made().fingerprint() == made().fingerprint()
+    assert len({made().fingerprint(), *(other.fingerprint() for other in others)}) == 9
+
+
+def test_a_trajectory_owns_its_arrays():
+    times, values, observed = TIMES.copy(), VALUES.copy(), ~np.isnan(VALUES)
+    one = ob.Trajectory(times, values, observed)
+    values[0, 0], times[0], observed[0, 0] = np.inf, np.nan, False
+    assert (one.times[0], one.values[0, 0], one.observed[0, 0]) == (0.0, 1.0, True)
+    backing = np.stack([VALUES, VALUES])
+    view = backing[0].view()
+    view.flags.writeable = False
+    aliased = ob.Trajectory(TIMES, view)
+    backing[:] = np.inf
+    assert aliased.values[0, 0] == 1.0
+
+
+def test_what_is_read_only_is_not_copied():
+    one = ob.Trajectory(TIMES, VALUES)
+    part = one.slice(1, 3)
+    assert np.shares_memory(part.values, one.values)
+    assert np.shares_memory(part.times, one.times)
+    made = owned(np.zeros((2, 3, 2)))
+    assert np.shares_memory(ob.Trajectory(TIMES, made[0]).values, made)
+    with pytest.raises(ValueError, match="read-only"):
+        made[0] = 1

@@ -124,5 +124,5 @@ def _merge(
     values = np.full((len(union), trajectory.channels), np.nan)
     observed = np.zeros(values.shape, dtype=bool)
     values[own], observed[own] = trajectory.values, trajectory.observed
-    merged = replace(trajectory, times=union, values=values, observed=observed, actions=None)
+    merged = replace(trajectory, times=union, values=values, observed=observed)
     return merged, rows

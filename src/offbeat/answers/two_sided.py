@@ -86,7 +86,6 @@ def reversed_in_time(dataset: Dataset) -> Dataset:
                 times=t.times[-1] - t.times[::-1],
                 values=t.values[::-1],
                 observed=t.observed[::-1],
-                actions=None if t.actions is None else t.actions[::-1],
             )
             for t in dataset
         ),

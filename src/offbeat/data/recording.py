@@ -1,9 +1,8 @@
-"""How recordings become a data set, whatever the format of their file.
+"""How recordings become a data set, the same for every file format.
 
-A reader says what stands in a file, as it was logged: a `Recording` per file or episode, with a
-`Signal` per sensor, topic or table. Whatever is to be decided about faults of clocks and sensors
-is decided here, once for all formats, by `ReaderOptions`; `assemble` applies them, counts what each did,
-and merges signals of different rates on the union of their stamps.
+A reader gives what a file holds, as it was logged: a `Recording` per file or episode, with a
+`Signal` per sensor, topic or table. `assemble` cleans them as `ReaderOptions` say, counts what it
+did in a log, and merges signals of different rates on the union of their time stamps.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from offbeat.data.arrays import owned
 from offbeat.data.cleaning import anomalies
 from offbeat.data.cleaning import channels as repairs
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
@@ -45,8 +45,7 @@ def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT)
 
     Returns:
         A trajectory per recording, or several where it was split. `meta` holds `time_unit`, the
-        `report` of what each policy did, `actions` (their names, where there are any), `labels`
-        (where recordings have them) and `clock_start`
+        `report` of what each policy did, `labels` (where recordings have them) and `clock_start`
         (what the recording's clock showed at time 0, in `time_unit`, where that was not 0), each
         with an entry per trajectory.
 
@@ -58,7 +57,6 @@ def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT)
     given = [recording for recording in waiting if recording is not None]
     channels = Channels.of(given, policies)
     unit = _common([recording.time_unit for recording in given], "ns")
-    actions = next((r.actions.channels for r in given if r.actions is not None), None)
     labelled = any(recording.label for recording in given)
     del given
     account = CleaningLog(
@@ -75,6 +73,8 @@ def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT)
             "there is no row to read: every recording is empty, or was left out as too short "
             f"(min_rows {policies.min_rows}); check the file, or give a smaller min_rows"
         )
+    for episode in episodes:
+        _hold_actions(episode, channels)
     _mask_held(episodes, channels, policies, account)
     if policies.unwrap:
         _unwrap(episodes, channels, account)
@@ -84,12 +84,13 @@ def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT)
     if policies.resample_hz is not None:
         for episode in episodes:
             _resample(episode, policies.resample_hz)
+            _hold_actions(episode, channels)
+    for episode in episodes:
+        owned(episode.values)
     trajectories = tuple(episode.trajectory(channels, policies) for episode in episodes)
     meta: dict[str, Any] = {"time_unit": unit}
     if labelled:
         meta["labels"] = [episode.label for episode in episodes]
-    if actions is not None:
-        meta["actions"] = list(actions)
     starts = [_clock(episode, unit) for episode in episodes]
     if policies.start == "first_row" and any(starts):
         meta["clock_start"] = starts
@@ -97,10 +98,24 @@ def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT)
     return Dataset(trajectories, {**meta, "report": account.report(policies, faulty)})
 
 
+def _hold_actions(episode: Episode, channels: Channels) -> None:
+    """Gives each row the action that holds then: the last one up to it, or the first one."""
+    for c, role in enumerate(channels.roles):
+        missing = np.isnan(episode.values[:, c])
+        if role != "action" or not missing.any() or missing.all():
+            continue
+        latest = np.maximum.accumulate(np.where(missing, -1, np.arange(len(missing))))
+        first = int(np.argmin(missing))
+        column = episode.own()[:, c]
+        column[:] = column[np.where(latest < 0, first, latest)]
+
+
 def _mask_held(
     episodes: list[Episode], channels: Channels, policies: ReaderOptions, account: CleaningLog
 ) -> None:
     for c, name in enumerate(channels.names):
+        if channels.roles[c] == "action":
+            continue  # a command that repeats is a command
         held = repairs.find_held([episode.values[:, c] for episode in episodes])
         if held is None:
             continue

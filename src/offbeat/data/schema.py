@@ -1,4 +1,4 @@
-"""What stands in the metadata of a stored data set: whatever the columns of its table don't say."""
+"""The schema of a stored data set: what the columns of its table cannot say, kept as metadata."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ import numpy as np
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError
 
-SCHEMA_VERSION = 1
-"""Counted up when files are written that an earlier version of this module would misread."""
+SCHEMA_VERSION = 2
+"""Raised when files are written that earlier versions would misread.
+
+Version 1, of Offbeat 0.1.0, has no roles, and columns of actions (`action|0`, ...) beside those of
+the channels; when it is read, they become channels with the role `action`.
+"""
 
 METADATA_KEY = b"offbeat"
 """The key of the schema, which is JSON, in the metadata of a Parquet file."""
@@ -26,7 +30,7 @@ CHECKSUM_KEY = b"offbeat_crc32"
 
 @dataclass(frozen=True)
 class Schema:
-    """The columns of a stored data set, its counts, and what travels with it.
+    """The columns of a stored data set, its counts, and its metadata.
 
     Args:
         version: of the schema.
@@ -34,10 +38,11 @@ class Schema:
         trajectories: their number.
         names: one per channel.
         units: one per channel.
+        roles: one per channel.
         observed: the channels in which observed and known differ, which have a column of their own.
-        actions: their number, or None where trajectories have none.
         origins: one per trajectory.
         meta: of the data set.
+        stored_as: one column name per channel.
     """
 
     version: int
@@ -45,10 +50,11 @@ class Schema:
     trajectories: int
     names: list[str]
     units: list[str]
+    roles: list[str]
     observed: list[str]
-    actions: int | None
     origins: list[str]
     meta: dict[str, Any]
+    stored_as: list[str]
 
     @classmethod
     def of(cls, dataset: Dataset) -> Schema:
@@ -57,7 +63,6 @@ class Schema:
         Raises:
             InputError: a channel has the name of another column.
         """
-        actions = dataset[0].actions
         differs = np.zeros(dataset.channels, dtype=bool)
         for t in dataset:
             differs |= (t.observed != t.known).any(axis=0)
@@ -67,10 +72,11 @@ class Schema:
             trajectories=len(dataset),
             names=list(dataset.names),
             units=list(dataset.units),
+            roles=list(dataset.roles),
             observed=[name for name, yes in zip(dataset.names, differs, strict=True) if yes],
-            actions=None if actions is None else actions.shape[1],
             origins=[t.origin for t in dataset],
             meta=dict(dataset.meta),
+            stored_as=list(dataset.names),
         )
         columns = schema.columns
         if len(set(columns)) < len(columns):
@@ -100,6 +106,8 @@ class Schema:
                 raise ValueError("its checksum does not match")
             fields = dict(json.loads(text))
             version = fields["version"]
+            if version == 1:
+                fields = _upgraded(fields)
             schema = None if version > SCHEMA_VERSION else cls(**fields)
         except (KeyError, TypeError, ValueError) as error:
             raise FileFormatError(
@@ -135,18 +143,13 @@ class Schema:
 
     @property
     def columns(self) -> list[str]:
-        """Names of all columns, in order."""
-        return ["trajectory", "time", *self.names, *self.observed_columns, *self.action_columns]
+        """Names of all columns."""
+        return ["trajectory", "time", *self.stored_as, *self.observed_columns]
 
     @property
     def observed_columns(self) -> list[str]:
-        """Names of the columns that say what may be looked at, in the order of `observed`."""
+        """Names of the columns of observed values, in the order of `observed`."""
         return [f"{name}|observed" for name in self.observed]
-
-    @property
-    def action_columns(self) -> list[str]:
-        """Names of the columns of actions."""
-        return [f"action|{i}" for i in range(self.actions or 0)]
 
     def to_arrow(self) -> Any:
         """The columns with their types, as a `pyarrow.Schema`."""
@@ -159,17 +162,35 @@ class Schema:
         """Compares with the columns that a file has, a `pyarrow.Schema`.
 
         Raises:
-            FileFormatError: names, types or order differ.
+            FileFormatError: names or types differ.
         """
         expected = [f"{field.name} ({field.type})" for field in self.to_arrow()]
         got = [f"{field.name} ({field.type})" for field in arrow]
-        if got != expected:
+        if sorted(got) != sorted(expected):
             missing = ", ".join(sorted(set(expected) - set(got))) or "none"
             unexpected = ", ".join(sorted(set(got) - set(expected))) or "none"
             raise FileFormatError(
                 f"{path} has other columns than its schema says: missing {missing}, unexpected "
                 f"{unexpected}; it was changed after it was written, write it with save"
             )
+
+
+def _upgraded(fields: dict[str, Any]) -> dict[str, Any]:
+    """The schema of version 1 in the form of version 2."""
+    fields = dict(fields)
+    names, meta = list(fields["names"]), dict(fields["meta"])
+    count = fields.pop("actions") or 0
+    columns = [f"action|{i}" for i in range(count)]
+    called = meta.pop("actions", [])
+    if len(called) != count or set(called) & set(names):
+        called = [f"action[{i}]" for i in range(count)]
+    return fields | {
+        "names": [*names, *called],
+        "units": [*fields["units"], *[""] * count],
+        "roles": ["state"] * len(names) + ["action"] * count,
+        "meta": meta,
+        "stored_as": [*names, *columns],
+    }
 
 
 def _checksum(text: bytes) -> bytes:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
+from offbeat.data.trajectory import ROLES
 from offbeat.errors import InputError, one_of
 
 KINDS = ("", "angle", "quaternion")
@@ -29,6 +30,8 @@ class Signal:
         kinds: per channel `""`, `angle` (rad, or degrees where its unit is `deg`) or `quaternion`
             (four channels in a row are one quaternion); by default `""`. A reader sets what it
             knows.
+        roles: one of `ROLES` per channel; by default `state`. A channel with the role `action`
+            keeps its last value until the next one was logged.
 
     Raises:
         InputError: shapes, types or numbers of names disagree.
@@ -40,12 +43,14 @@ class Signal:
     channels: tuple[str, ...]
     units: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         where = f" of signal {self.name!r}" if self.name else ""
         width = len(self.channels)
         units = tuple(self.units) or ("",) * width
         kinds = tuple(self.kinds) or ("",) * width
+        roles = tuple(self.roles) or ("state",) * width
         if self.stamps.dtype != np.int64 or self.stamps.ndim != 1:
             raise InputError(
                 f"stamps{where} must be int64 nanoseconds of shape (n,), got {self.stamps.dtype} "
@@ -57,11 +62,13 @@ class Signal:
                 f"stamp and a column per channel, got {self.values.dtype} of shape "
                 f"{self.values.shape}"
             )
-        if len(units) != width or len(kinds) != width:
+        if not len(units) == len(kinds) == len(roles) == width:
             raise InputError(
-                f"got {len(units)} units and {len(kinds)} kinds for {width} channels{where}; "
-                "give one of each per channel"
+                f"got {len(units)} units, {len(kinds)} kinds and {len(roles)} roles for {width} "
+                f"channels{where}; give one of each per channel"
             )
+        for role in roles:
+            one_of("role of a channel", role, ROLES)
         for kind in kinds:
             one_of("kind of channel", kind, KINDS)
         if kinds.count("quaternion") % 4:
@@ -72,6 +79,7 @@ class Signal:
         object.__setattr__(self, "channels", tuple(self.channels))
         object.__setattr__(self, "units", units)
         object.__setattr__(self, "kinds", kinds)
+        object.__setattr__(self, "roles", roles)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +96,9 @@ class Recording:
             fps".
         clock_zero: what the file's clock shows at stamp 0, in `time_unit`, where the stamps do not
             count from the clock's own zero because that would exceed an int64.
-        actions: what was commanded, on the same clock, in the order of time. A row of a trajectory
-            has the action that held then: the last one up to its stamp, or the first one.
 
     Raises:
-        InputError: the unit is unknown, or there are no actions in `actions`.
+        InputError: the unit is unknown.
     """
 
     signals: tuple[Signal, ...]
@@ -101,11 +107,8 @@ class Recording:
     time_unit: str = "ns"
     notes: tuple[str, ...] = ()
     clock_zero: int = 0
-    actions: Signal | None = None
 
     def __post_init__(self) -> None:
         one_of("time unit", self.time_unit, NANOSECONDS_PER)
-        if self.actions is not None and not self.actions.values.size:
-            raise InputError("actions must hold a row at least, got none; leave them out")
         object.__setattr__(self, "signals", tuple(self.signals))
         object.__setattr__(self, "notes", tuple(self.notes))

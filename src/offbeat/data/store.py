@@ -1,9 +1,9 @@
 """Data sets on disk: one Parquet file, one row per time, our schema in its metadata.
 
-Columns, in this order: `trajectory` (int32, counted from 0), `time` (float64, seconds), one float64
-column per channel (NaN = not known), `name|observed` (bool) for the channels in which observed and
-known differ, `action|0`, `action|1`, ... (float64). Any Parquet library reads such a file; the key
-`offbeat` of its metadata holds, as JSON, what columns can't.
+The columns are `trajectory` (int32, counted from 0), `time` (float64, seconds), one float64 column
+per channel (NaN = not known), and `name|observed` (bool) for the channels in which some known value
+is not observed. Any Parquet library reads such a file; the key `offbeat` of its metadata holds the
+schema as JSON.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.arrays import owned
 from offbeat.data.memory import require_rows
 from offbeat.data.schema import METADATA_KEY, Schema
 from offbeat.data.source import require_file
@@ -44,7 +45,6 @@ def save(dataset: Dataset, path: str | Path) -> None:
     schema = Schema.of(dataset)
     arrow = schema.to_arrow().with_metadata(schema.to_metadata())
     repetitive = ["trajectory", "time"]
-    numbers = [*schema.names, *schema.action_columns]
     with (
         atomic_path(path) as temporary,
         pq.ParquetWriter(
@@ -52,7 +52,7 @@ def save(dataset: Dataset, path: str | Path) -> None:
             arrow,
             compression="zstd",
             use_dictionary=repetitive,
-            use_byte_stream_split=numbers,
+            use_byte_stream_split=schema.stored_as,
             write_statistics=repetitive,
             write_page_checksum=True,
         ) as writer,
@@ -122,9 +122,6 @@ def _row_groups(dataset: Dataset, schema: Schema) -> Iterator[dict[str, NDArray[
         columns |= {name: values[:, c] for name, c in channel.items()}
         for name, column in zip(schema.observed, schema.observed_columns, strict=True):
             columns[column] = np.concatenate([t.observed[:, channel[name]] for t in group])
-        if schema.actions:
-            actions = np.concatenate([t.actions for t in group if t.actions is not None])
-            columns |= {name: actions[:, a] for a, name in enumerate(schema.action_columns)}
         yield columns
         group, start, rows = [], i + 1, 0
 
@@ -133,7 +130,7 @@ def _data_set(table: Any, schema: Schema, path: Path) -> Dataset:
     for name in ("trajectory", *schema.observed_columns):
         if table.column(name).null_count:
             raise FileFormatError(
-                f"{path} has empty cells in column {name!r}, where every row needs a value; "
+                f"{path} has empty values in column {name!r}, where every row needs a value; "
                 "it was changed after it was written, write it with save"
             )
     number = table.column("trajectory").to_numpy()
@@ -148,27 +145,26 @@ def _data_set(table: Any, schema: Schema, path: Path) -> Dataset:
             f"schema says {schema.rows} rows of {schema.trajectories}, one after the other; it was "
             "changed after it was written, write it with save"
         )
-    times = table.column("time").to_numpy()
-    values = _matrix(table, schema.names)
+    times = owned(table.column("time").to_numpy())
+    values = _matrix(table, schema.stored_as)
     observed = None
     if schema.observed:
         observed = ~np.isnan(values)
         for name, column in zip(schema.observed, schema.observed_columns, strict=True):
             observed[:, schema.names.index(name)] = table.column(column).to_numpy()
-    actions = None
-    if schema.actions is not None:
-        actions = _matrix(table, schema.action_columns)
+        owned(observed)
+    owned(values)
     ends = [*starts[1:], len(number)]
-    names, units = tuple(schema.names), tuple(schema.units)
+    names, units, roles = tuple(schema.names), tuple(schema.units), tuple(schema.roles)
     try:
         trajectories = tuple(
             Trajectory(
                 times[start:end],
                 values[start:end],
                 **({} if observed is None else {"observed": observed[start:end]}),
-                actions=None if actions is None else actions[start:end],
                 names=names,
                 units=units,
+                roles=roles,
                 origin=origin,
             )
             for start, end, origin in zip(starts, ends, schema.origins, strict=True)

@@ -1,8 +1,9 @@
-"""The first noun: a trajectory, checked when it is made, and the data set that holds many."""
+"""Trajectories, which are checked when they are made, and data sets, which hold many."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, overload
@@ -10,39 +11,47 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.data.arrays import frozen, owned
 from offbeat.errors import InputError, one_of
 
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
 """Units of time that input may be given in; inside, times are seconds."""
 
+ROLES = ("state", "action", "exogenous")
+"""What a channel is to a model: a `state` is observed and predicted; an `action` is given, or
+predicted and fed back; an `exogenous` channel is observed and never predicted."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """What was measured over time: rows of channel values at strictly increasing times.
+    """Values of several channels at strictly increasing times, one row per time.
 
-    *Known* and *observed* differ: a cell that `mask_out` hid is known to the score and unseen by the
-    model. `values` is NaN where a cell is not known; `observed` says what a model may look at.
+    A value is *known* where it is not NaN. It is *observed* where a model may use it: `mask_out`
+    leaves values known, so that predictions can be scored, and marks them as not observed.
+
+    A trajectory owns its arrays: they are copied, and read-only. Arrays that are read-only already,
+    down to the array that owns the memory, are not copied.
 
     Args:
         times: (rows,) seconds, finite, strictly increasing; stored as float64.
         values: (rows, channels) NaN where not known; stored as float64.
-        observed: (rows, channels) bool; by default every known cell.
-        actions: (rows, actions) or None; finite.
+        observed: (rows, channels) bool; by default every known value.
         names: one unique name per channel; by default `channel_0`, `channel_1`, ...
         units: one unit per channel, such as `rad/s`; by default empty.
+        roles: one of `ROLES` per channel; by default `state`.
         origin: where it came from, for messages and reports.
 
     Raises:
         InputError: shapes disagree, times are not finite or do not increase, a value is infinite,
-            a cell is marked as observed where its value is NaN, or names repeat.
+            a value is marked as observed and is NaN, names repeat, or a role is unknown.
     """
 
     times: NDArray[np.float64]
     values: NDArray[np.float64]
     observed: NDArray[np.bool_] = None  # type: ignore[assignment]  # filled in below
-    actions: NDArray[np.float64] | None = None
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
     origin: str = ""
 
     def __post_init__(self) -> None:
@@ -62,56 +71,39 @@ class Trajectory:
                 "it needs at least one of each, leave it out"
             )
         _check_times(times, where)
-        names = tuple(self.names) or tuple(f"channel_{i}" for i in range(values.shape[1]))
-        units = tuple(self.units) or ("",) * len(names)
-        if len(names) != values.shape[1] or len(units) != values.shape[1]:
-            raise InputError(
-                f"got {len(names)} names and {len(units)} units for {values.shape[1]} "
-                f"channels{where}; give one of each per channel"
-            )
-        if len(set(names)) != len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"the channel name {twice!r} stands twice{where}; names are unique")
+        names, units, roles = _described(self, values.shape[1], where)
         if np.isinf(values).any():
             row, channel = np.argwhere(np.isinf(values))[0]
             raise InputError(
                 f"values{where} are infinite at row {row}, channel {names[channel]!r}; "
-                "use NaN for a cell that is not known"
+                "use NaN for a value that is not known"
             )
         known = np.isnan(values)
         np.logical_not(known, out=known)
-        observed = known if self.observed is None else np.asarray(self.observed)
-        if observed.dtype != np.bool_ or observed.shape != values.shape:
-            raise InputError(
-                f"observed{where} must be bool of shape {values.shape}, as values has, got "
-                f"{observed.dtype} of shape {observed.shape}"
-            )
-        if observed is not known and (observed & ~known).any():
-            row, channel = np.argwhere(observed & ~known)[0]
-            raise InputError(
-                f"observed{where} is True at row {row}, channel {names[channel]!r}, where the "
-                "value is NaN; "
-                "a cell that is not known can't be observed"
-            )
-        actions = None if self.actions is None else _array(self.actions, "actions", where)
-        if actions is not None and (actions.ndim != 2 or len(actions) != len(times)):
-            raise InputError(
-                f"actions{where} must have shape ({len(times)}, actions), got {actions.shape}"
-            )
-        if actions is not None and not np.isfinite(actions).all():
-            row = int(np.argwhere(~np.isfinite(actions))[0][0])
-            raise InputError(f"actions{where} are not finite at row {row}")
+        if self.observed is None:
+            observed = owned(known)
+        else:
+            observed = np.asarray(self.observed)
+            if observed.dtype != np.bool_ or observed.shape != values.shape:
+                raise InputError(
+                    f"observed{where} must be bool of shape {values.shape}, as values has, got "
+                    f"{observed.dtype} of shape {observed.shape}"
+                )
+            observed = frozen(self.observed, np.bool_)
+            if (observed & ~known).any():
+                row, channel = np.argwhere(observed & ~known)[0]
+                raise InputError(
+                    f"observed{where} is True at row {row}, channel {names[channel]!r}, where the "
+                    "value is NaN; a value that is not known cannot be observed"
+                )
         for name, value in (
             ("times", times),
             ("values", values),
             ("observed", observed),
-            ("actions", actions),
             ("names", names),
             ("units", units),
+            ("roles", roles),
         ):
-            if isinstance(value, np.ndarray):
-                value = value.view()
-                value.flags.writeable = False
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -120,8 +112,8 @@ class Trajectory:
     ) -> Trajectory:
         """Makes a trajectory from times in any unit, integer clocks included.
 
-        Integer clocks (nanoseconds since 1970, say) are first taken relative to the first row, so
-        that nothing is lost to rounding.
+        The first time of an integer clock, such as nanoseconds since 1970, is subtracted before
+        the clock becomes float64, so that nothing is lost to rounding.
 
         Args:
             times: (rows,) in `time_unit`.
@@ -154,14 +146,19 @@ class Trajectory:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(rows, channels) True where the value is known, observed or hidden."""
+        """(rows, channels) True where the value is known, observed or masked."""
         return ~np.isnan(self.values)
 
+    @property
+    def actions(self) -> NDArray[np.float64] | None:
+        """(rows, actions) values of the channels with the role `action`; None without any."""
+        chosen = [i for i, role in enumerate(self.roles) if role == "action"]
+        return self.values[:, chosen] if chosen else None
+
     def __repr__(self) -> str:
-        share = f"{100 * self.observed.mean():.0f} % observed"
         return (
-            f"Trajectory({self.rows} rows, {self.channels} channels, "
-            f"{self.times[0]:g} to {self.times[-1]:g} s, {share})"
+            f"Trajectory({self.rows} rows, {self.channels} channels, {self.times[0]:g} to "
+            f"{self.times[-1]:g} s, {100 * self.observed.mean():.0f} % observed)"
         )
 
     def slice(self, start: int, stop: int) -> Trajectory:
@@ -172,13 +169,44 @@ class Trajectory:
             times=self.times[rows],
             values=self.values[rows],
             observed=self.observed[rows],
-            actions=None if self.actions is None else self.actions[rows],
         )
+
+    def select(self, index: Sequence[int]) -> Trajectory:
+        """The channels at these positions, in this order."""
+        order = list(index)
+        return replace(
+            self,
+            values=owned(self.values[:, order]),
+            observed=owned(self.observed[:, order]),
+            names=tuple(self.names[i] for i in order),
+            units=tuple(self.units[i] for i in order),
+            roles=tuple(self.roles[i] for i in order),
+        )
+
+
+def _described(
+    trajectory: Trajectory, channels: int, where: str
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Name, unit and role of each channel, checked."""
+    names = tuple(trajectory.names) or tuple(f"channel_{i}" for i in range(channels))
+    units = tuple(trajectory.units) or ("",) * channels
+    roles = tuple(trajectory.roles) or ("state",) * channels
+    if not len(names) == len(units) == len(roles) == channels:
+        raise InputError(
+            f"got {len(names)} names, {len(units)} units and {len(roles)} roles for {channels} "
+            f"channels{where}; give one of each per channel"
+        )
+    if len(set(names)) != len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"the channel name {twice!r} stands twice{where}; names are unique")
+    for role in roles:
+        one_of("role of a channel", role, ROLES)
+    return names, units, roles
 
 
 def _array(value: ArrayLike, what: str, where: str) -> NDArray[np.float64]:
     try:
-        return np.asarray(value, dtype=np.float64)
+        return frozen(value, np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{what}{where} must be numbers: {error}") from None
 
@@ -204,8 +232,8 @@ class Dataset(Sequence[Trajectory]):
     """Trajectories of the same channels, and what is known of how they were made.
 
     Args:
-        trajectories: at least one, all with the same names and units.
-        meta: JSON-like facts that travel with the data: robot, seed, generator versions.
+        trajectories: at least one, all with the same names, units and roles.
+        meta: JSON-like information that is kept with the data: robot, seed, generator versions.
 
     Raises:
         InputError: there is no trajectory, or channels differ between trajectories.
@@ -220,15 +248,10 @@ class Dataset(Sequence[Trajectory]):
             raise InputError("a data set needs at least one trajectory, got none")
         first = trajectories[0]
         for i, other in enumerate(trajectories):
-            if other.names != first.names or other.units != first.units:
+            if _channels(other) != _channels(first):
                 raise InputError(
                     f"trajectory {i} has channels {_list(other)}, the first one has "
                     f"{_list(first)}; a data set holds trajectories of the same channels"
-                )
-            if _width(other.actions) != _width(first.actions):
-                raise InputError(
-                    f"trajectory {i} has {_width(other.actions)} actions, the first one has "
-                    f"{_width(first.actions)}; a data set holds trajectories of the same actions"
                 )
         object.__setattr__(self, "trajectories", trajectories)
         object.__setattr__(self, "meta", dict(self.meta))
@@ -242,6 +265,11 @@ class Dataset(Sequence[Trajectory]):
     def units(self) -> tuple[str, ...]:
         """Channel units."""
         return self.trajectories[0].units
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Channel roles, see `ROLES`."""
+        return self.trajectories[0].roles
 
     @property
     def channels(self) -> int:
@@ -267,10 +295,20 @@ class Dataset(Sequence[Trajectory]):
         """The trajectories at these positions, in this order."""
         return replace(self, trajectories=tuple(self.trajectories[int(i)] for i in index))
 
-    def fingerprint(self) -> str:
-        """SHA-256 of names, times, values and masks: equal for equal data alone."""
-        digest = hashlib.sha256("\0".join(self.names).encode())
-        for trajectory in self:
+    def fingerprint(self, version: int = 2) -> str:
+        """SHA-256 of names, units, roles, times, values and masks: equal for equal data alone.
+
+        Args:
+            version: 1 gives the fingerprint of Offbeat 0.1.0, which leaves out units and actions.
+        """
+        described, dataset = json.dumps([self.names, self.units, self.roles]), self
+        if version == 1:
+            dataset = self.select(
+                [n for n, r in zip(self.names, self.roles, strict=True) if r != "action"]
+            )
+            described = "\0".join(dataset.names)
+        digest = hashlib.sha256(described.encode())
+        for trajectory in dataset:
             for array in (trajectory.times, trajectory.values, trajectory.observed):
                 digest.update(array.tobytes())
         return digest.hexdigest()
@@ -282,31 +320,24 @@ class Dataset(Sequence[Trajectory]):
             InputError: a name is not among the channels.
         """
         order = [self.names.index(one_of("channel", name, self.names)) for name in names]
-        chosen = (
-            replace(
-                t,
-                values=t.values[:, order],
-                observed=t.observed[:, order],
-                names=tuple(t.names[i] for i in order),
-                units=tuple(t.units[i] for i in order),
-            )
-            for t in self
-        )
-        return replace(self, trajectories=tuple(chosen))
+        return replace(self, trajectories=tuple(t.select(order) for t in self))
 
     def __repr__(self) -> str:
         rows = sum(t.rows for t in self)
-        share = sum(int(t.observed.sum()) for t in self) / (rows * self.channels)
+        observed = sum(int(t.observed.sum()) for t in self) / (rows * self.channels)
         return (
             f"Dataset({len(self)} trajectories, {rows} rows, {self.channels} channels, "
-            f"{100 * share:.0f} % observed)"
+            f"{100 * observed:.0f} % observed)"
         )
 
 
-def _width(actions: NDArray[np.float64] | None) -> int:
-    return 0 if actions is None else int(actions.shape[1])
+def _channels(trajectory: Trajectory) -> tuple[tuple[str, ...], ...]:
+    return trajectory.names, trajectory.units, trajectory.roles
 
 
 def _list(trajectory: Trajectory) -> str:
-    pairs = zip(trajectory.names, trajectory.units, strict=True)
-    return ", ".join(f"{name} [{unit}]" for name, unit in pairs)
+    """Channels with their units, and their roles where these are not `state`, for messages."""
+    return ", ".join(
+        f"{name} [{unit}]" + (f" ({role})" if role != "state" else "")
+        for name, unit, role in zip(*_channels(trajectory), strict=True)
+    )

@@ -26,6 +26,7 @@ class Channels:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
+    roles: tuple[str, ...]
     columns: dict[tuple[str, str], int]  # by signal and channel
     angles: dict[int, float]  # the full turn of each, in its unit
     quaternions: tuple[tuple[int, ...], ...]
@@ -43,15 +44,17 @@ class Channels:
         columns: dict[tuple[str, str], int] = {}
         units: list[str] = []
         kinds: list[str] = []
+        roles: list[str] = []
         looked_at: set[str] = set()
         for signal in (signal for recording in recordings for signal in recording.signals):
-            for channel, unit, kind in zip(
-                signal.channels, signal.units, signal.kinds, strict=True
+            for channel, unit, kind, role in zip(
+                signal.channels, signal.units, signal.kinds, signal.roles, strict=True
             ):
                 at = columns.setdefault((signal.name, channel), len(columns))
                 if at == len(units):
                     units.append(unit)
                     kinds.append(kind)
+                    roles.append(role)
                 units[at] = units[at] or unit
                 kinds[at] = kinds[at] or kind
                 if unit not in ("", units[at]):
@@ -72,6 +75,9 @@ class Channels:
             raise FileFormatError(f"the channel name {twice!r} stands twice; names are unique")
         if not names:
             raise FileFormatError("there is no channel to read, only times")
+        for option, role in (("actions", "action"), ("exogenous", "exogenous")):
+            for name in getattr(policies, option):
+                roles[names.index(one_of(f"channel in {option}", name, names))] = role
         for name in policies.angles:
             kinds[names.index(one_of("channel in angles", name, names))] = "angle"
         left_out = {one_of("channel in without", name, names) for name in policies.without}
@@ -84,6 +90,7 @@ class Channels:
         return cls(
             chosen,
             tuple(units[at] for at in kept),
+            tuple(roles[at] for at in kept),
             {key: kept[at] for key, at in columns.items() if at in kept},
             {
                 kept[at]: 360.0 if units[at].casefold() in _DEGREES else 2 * np.pi
@@ -93,7 +100,8 @@ class Channels:
             tuple(
                 tuple(kept[at] for at in four)
                 for four in whole
-                if policies.quaternions == "continuous" and all(at in kept for at in four)
+                if policies.quaternions == "continuous"
+                and all(at in kept and roles[at] != "action" for at in four)
             ),
         )
 
@@ -146,24 +154,13 @@ class Episode:
             return Trajectory(
                 (self.stamps - zero) / 1e9,
                 self.values,
-                actions=_held_actions(self.recording.actions, self.stamps),
                 names=channels.names,
                 units=channels.units,
+                roles=channels.roles,
                 origin=origin,
             )
         except InputError as error:
             raise FileFormatError(str(error)) from None
-
-
-def _held_actions(actions: Signal | None, stamps: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """(rows, actions) the action that held at each stamp: the last one up to it, or the first."""
-    if actions is None:
-        return None
-    if np.array_equal(actions.stamps, stamps):
-        return actions.values
-    order = np.argsort(actions.stamps, kind="stable")
-    held = np.searchsorted(actions.stamps[order], stamps, side="right") - 1
-    return actions.values[order[np.maximum(held, 0)]]
 
 
 def cut(

@@ -23,6 +23,8 @@ class ReaderOptions:
         channels: names of the channels to keep, as a data set of all would call them, in the order
             wanted; None keeps all. Rows in which none of them was logged are not read.
         without: names of channels to leave out.
+        actions: channels that are commands, beside those that the format knows as such.
+        exogenous: channels that are observed and not to be predicted.
         order: rows whose stamp is lower than one before it: `sort` them in, `drop` them, or
             `refuse` the file.
         duplicates: of the known cells of a channel at one stamp the `last` or `first` one logged,
@@ -52,6 +54,8 @@ class ReaderOptions:
 
     channels: tuple[str, ...] | None = None
     without: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
+    exogenous: tuple[str, ...] = ()
     order: Literal["sort", "drop", "refuse"] = "sort"
     duplicates: Literal["last", "first", "mean", "refuse"] = "last"
     clock_jumps: Literal["split", "join", "refuse"] = "split"
@@ -81,6 +85,8 @@ class ReaderOptions:
         for name, names in (
             ("channels", self.channels),
             ("without", self.without),
+            ("actions", self.actions),
+            ("exogenous", self.exogenous),
             ("angles", self.angles),
         ):
             if names is None:

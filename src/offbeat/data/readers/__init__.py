@@ -111,6 +111,8 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
     load_entry_points()
     reader = reader_of(path) if format is None else READERS[one_of("format", format, READERS)]
     own, known = reader.options, options_of(reader)
+    if isinstance(options.get("actions"), bool) and "include_actions" in own:
+        options["include_actions"] = options.pop("actions")  # as Offbeat 0.1.0 called it
     for option in options:
         if not known:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")

@@ -52,7 +52,7 @@ def recordings(
     path: str | Path,
     *,
     keys: Sequence[str] | None = None,
-    actions: bool = True,
+    include_actions: bool = True,
     mask: str | None = None,
     rate_hz: float | None = None,
     time_unit: str | None = None,
@@ -63,7 +63,7 @@ def recordings(
         path: the file, or the folder of a Minari data set.
         keys: the observations to read, such as `robot0_eef_pos`, or `achieved_goal` in Minari; by
             default all that are numbers, but for pictures.
-        actions: whether the actions are read, too.
+        include_actions: whether the actions are read, too; their channels have the role `action`.
         mask: robomimic's name of a subset of the episodes, such as `train`.
         rate_hz: rows per second. By default that of the environment where the file says it; else
             rows are taken to be 1 s apart, and that is said aloud.
@@ -108,7 +108,7 @@ def recordings(
             observations = _observations(root[name], path, robomimic=robomimic)
             yield _episode(
                 root[name], observations, path, notes,
-                keys=keys, actions=actions, rate=rate, time_unit=time_unit,
+                keys=keys, actions=include_actions, rate=rate, time_unit=time_unit,
             )  # fmt: skip
 
 
@@ -233,17 +233,22 @@ def _episode(
     if left:
         notes = (*notes, f"left out: {', '.join(left)}")
     called = {name: _names(name, values.shape[1]) for name, values in arrays.items()}
+    kinds = [kind for name, channels in called.items() for kind in _kinds(name, channels)]
+    parts = list(arrays.values())
+    states = [channel for channels in called.values() for channel in channels]
+    acted: list[str] = []
+    if actions:
+        values, acted, more = _actions(episode, path, n)
+        parts += values
+        notes = (*notes, *more)
     signal = Signal(
         "",
         stamps,
-        np.hstack(list(arrays.values())),
-        tuple(channel for channels in called.values() for channel in channels),
-        kinds=tuple(kind for name, channels in called.items() for kind in _kinds(name, channels)),
+        np.hstack(parts),
+        (*states, *acted),
+        kinds=(*kinds, *[""] * len(acted)),
+        roles=("state",) * len(states) + ("action",) * len(acted),
     )
-    acted = None
-    if actions:
-        acted, more = _actions(episode, path, stamps)
-        notes = (*notes, *more)
     label = episode.name.rpartition("/")[2]
     return Recording(
         (signal,),
@@ -252,7 +257,6 @@ def _episode(
         time_unit=unit,
         notes=notes,
         clock_zero=zero,
-        actions=acted,
     )
 
 
@@ -309,29 +313,28 @@ def _kinds(name: str, channels: list[str]) -> list[str]:
 
 
 def _actions(
-    episode: Any, path: Path, stamps: NDArray[np.int64]
-) -> tuple[Signal | None, tuple[str, ...]]:
-    """The actions, one per row of the observations; of a space of many, side by side."""
+    episode: Any, path: Path, rows: int
+) -> tuple[list[NDArray[np.float64]], list[str], tuple[str, ...]]:
+    """Values and names of the actions, one per row of the observations, and what is to be said."""
     if "actions" not in episode:
-        return None, ("there are no actions",)
-    parts, channels = [], []
+        return [], [], ("there are no actions",)
+    parts: list[NDArray[np.float64]] = []
+    channels: list[str] = []
     for name, dataset in _leaves(episode["actions"], ""):
         _refuse_objects(dataset, path)
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
-            return None, (f"actions are left out, they hold {_what(dataset)}",)
+            return [], [], (f"actions are left out, they hold {_what(dataset)}",)
         values = np.asarray(dataset[()], dtype=np.float64)
         parts.append(values.reshape(len(values), -1))
         start = f"action.{name}" if name else "action"
         channels += [f"{start}[{i}]" for i in range(parts[-1].shape[1])]
-    n = len(stamps)
-    if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (n, n - 1):
+    if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (rows, rows - 1):
         raise FileFormatError(
-            f"{path}: {episode.name} has {[len(part) for part in parts]} actions for {n} "
-            "observations, expected as many or one less; read it without, with actions=False"
+            f"{path}: {episode.name} has {[len(part) for part in parts]} actions for {rows} "
+            "observations, expected as many or one less; read it without, with "
+            "include_actions=False"
         )
-    values = np.hstack(parts)
-    notes: tuple[str, ...] = ()
-    if len(values) == n - 1 and len(values):
-        values = np.vstack([values, values[-1:]])
-        notes = ("the last observation has no action of its own; the one before stands there",)
-    return Signal("action", stamps, values, tuple(channels)), notes
+    if len(parts[0]) == rows or rows == 1:
+        return parts if len(parts[0]) else [], channels if len(parts[0]) else [], ()
+    last = [np.vstack([part, part[-1:]]) for part in parts]
+    return last, channels, ("the last observation has no action; that of the row before is used",)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import state_time_unit, to_nanoseconds
 from offbeat.data.memory import require_rows
-from offbeat.data.readers.lerobot_info import Feature, Info, Rows, read_columns
+from offbeat.data.readers.lerobot_info import WIDEST, Feature, Info, Rows, read_columns
 from offbeat.data.signals import Recording, Signal
 from offbeat.errors import FileFormatError, one_of
 
@@ -48,7 +48,7 @@ def recordings(
     *,
     episodes: Sequence[int] | int | None = None,
     columns: Sequence[str] | None = None,
-    actions: bool = True,
+    include_actions: bool = True,
     time_column: str | None = None,
     time_unit: str | None = None,
 ) -> Iterator[Recording]:
@@ -60,7 +60,8 @@ def recordings(
         episodes: numbers of the episodes to read; by default all.
         columns: features to read as channels, such as `observation.state`; by default all that
             are numbers, but for actions, rewards and bookkeeping.
-        actions: whether the feature `action` (or `actions`) is read, too.
+        include_actions: whether the features `action` (or `actions`) and `action.*` are read, too;
+            their channels have the role `action`.
         time_column: column of the stamps; by default one that is named like a time and is no mere
             row number / fps, else row number / fps.
         time_unit: unit of that column; by default what its name says, else found.
@@ -90,9 +91,11 @@ def recordings(
             one_of("episode", str(number), map(str, files))
         files = {number: files[number] for number in sorted(set(episodes))}
     chosen, notes = info.chosen(columns)
-    acted = (
-        [f for f in info.features.values() if f.name in ("action", "actions")] if actions else []
-    )
+    acted = [
+        f
+        for f in info.features.values()
+        if include_actions and f.role == "action" and f not in chosen and f.width <= WIDEST
+    ]
     lengths = [at.length or 0 for at in files.values()]
     width = sum(feature.width for feature in (*chosen, *acted))
     require_rows(root, sum(lengths), width, "choose episodes= or columns=")
@@ -148,16 +151,15 @@ class _Reading:
             raise FileFormatError(f"{at.file}: the rows of episode {number} do not stand together")
         stamps, zero, unit, said = self._stamps(episode, at.file)
         alone = len(self.chosen) == 1
-        channels = [name for f in self.chosen for name in f.channels(alone=alone)]
-        signal = Signal("", stamps, _matrix(episode, self.chosen, at.file), tuple(channels))
-        actions = None
-        if self.acted:
-            actions = Signal(
-                "action",
-                stamps,
-                _matrix(episode, self.acted, at.file),
-                tuple(name for f in self.acted for name in f.channels(alone=True)),
-            )
+        features = [*self.chosen, *self.acted]
+        named = [f.channels(alone=alone and f in self.chosen) for f in features]
+        signal = Signal(
+            "",
+            stamps,
+            _matrix(episode, features, at.file),
+            tuple(name for names in named for name in names),
+            roles=tuple(f.role for f, names in zip(features, named, strict=True) for _ in names),
+        )
         return Recording(
             (signal,),
             label=str(number),
@@ -165,7 +167,6 @@ class _Reading:
             time_unit=unit,
             notes=(*said, *self.notes),
             clock_zero=zero,
-            actions=actions,
         )
 
     def _stamps(

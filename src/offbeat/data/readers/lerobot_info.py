@@ -44,6 +44,12 @@ class Feature:
         return _NUMBERS.fullmatch(self.dtype) is not None
 
     @property
+    def role(self) -> str:
+        """`action` where it holds commands, by its name; else `state`."""
+        acted = self.name in ("action", "actions") or self.name.startswith("action.")
+        return "action" if acted and self.is_number else "state"
+
+    @property
     def is_time(self) -> bool:
         """Whether it is named like a time, `timestamp` or `observation.time_ns`."""
         last = self.name.rpartition(".")[2]
