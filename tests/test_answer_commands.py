@@ -244,7 +244,7 @@ def test_a_thesis_model_fills_at_its_rows_and_says_why_it_cannot_forecast(log, t
     assert main(["train", str(log), str(out), *READER, *PARTS, *options, *MODEL[2:]]) == 0
     assert main(["impute", str(out), str(log), str(tmp_path / "a.csv")]) == 0
     error = one_line_error(capsys, "forecast", out, log, tmp_path / "b.csv", "--horizons=0.1")
-    assert "can't be asked for times" in error
+    assert "can't predict at other times" in error
 
 
 def test_a_channel_named_like_a_mask_is_refused():

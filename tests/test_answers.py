@@ -394,11 +394,32 @@ def test_an_extrapolation_is_a_prediction_after_the_last_row():
         assert a.known.all()
 
 
-@pytest.mark.parametrize("horizons", [[], [0.0, 1.0], [-1.0], [0.2, 0.1], [NAN], ["soon"]])
-def test_horizons_that_are_none_are_refused(horizons):
+@pytest.mark.parametrize(
+    "horizons",
+    [[], [0.0, 1.0], [-1.0], [0.2, 0.1], NAN, [NAN], ["soon"], "0.1", None, True, [[0.1], [0.2]]],
+)
+def test_horizons_that_are_none_are_refused_in_one_line(horizons):
     data = dataset(2)
-    with pytest.raises(ob.InputError, match="horizons must be"):
-        ob.forecast(small_model("gru", data), data, horizons)
+    model = small_model("gru", data)
+    for answer in (ob.forecast, ob.score_forecast):
+        with pytest.raises(ob.InputError) as refused:
+            answer(model, data, horizons)
+        assert "\n" not in str(refused.value)
+
+
+def test_one_horizon_is_a_number_and_extrapolate_is_forecast():
+    data = dataset(2)
+    model = small_model("gru", data)
+    assert ob.extrapolate is ob.forecast
+    for a, b in zip(ob.forecast(model, data, 0.1), ob.forecast(model, data, [0.1]), strict=True):
+        assert np.array_equal(a.values, b.values)
+
+
+@pytest.mark.parametrize("targets", [0, -1, 2.5, True])
+def test_numbers_of_targets_that_are_none_are_refused(targets):
+    data = dataset(2, rows=30)
+    with pytest.raises(ob.InputError, match="targets"):
+        ob.score_forecast(small_model("gru", data), data, 0.1, targets=targets)
 
 
 # --- scores ---------------------------------------------------------------------------------------

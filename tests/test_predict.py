@@ -40,18 +40,45 @@ def test_own_times_per_trajectory_and_times_after_the_last_row():
 
 
 @pytest.mark.parametrize(
-    ("times", "message"),
+    "times",
     [
-        ([0.2, 0.1], "increase strictly"),
-        ([], "no time is asked of trajectory 0"),
-        ([float("nan")], "finite"),
-        ([[0.1], [0.2], [0.3]], "times for 3 trajectories, the data has 2"),
+        [0.2, 0.1],
+        [],
+        float("nan"),
+        [0.1, float("inf")],
+        "soon",
+        "0.1",
+        ["0.1"],
+        [None],
+        {"t": 0.1},
+        True,
+        1j,
+        np.zeros((2, 2, 1)),
+        [[0.1], [0.2], [0.3]],
+        [[0.1], []],
+        [0.1, [0.2, 0.1]],
     ],
 )
-def test_times_that_cannot_be_asked_for_are_refused(times, message):
+def test_times_that_are_none_are_refused_in_one_line(times):
     data = dataset(2)
-    with pytest.raises(ob.InputError, match=message):
+    with pytest.raises(ob.InputError) as refused:
         ob.predict(small_model("gru", data), data, times=times)
+    assert "\n" not in str(refused.value)
+
+
+def test_one_time_is_asked_of_every_trajectory():
+    data = dataset(2)
+    model = small_model("gru", data)
+    for one in (0.1, np.float32(0.1), np.array(0.1), [0.1], (0.1,), np.array([0.1]), -1, [-0.5]):
+        got = ob.predict(model, data, times=one)
+        assert [t.times.tolist() for t in got] == [np.ravel(one).astype(float).tolist()] * 2
+
+
+@pytest.mark.parametrize("options", [{"size": 0}, {"size": 2.0}, {"seed": -1}, {"seed": 0.5}])
+def test_sizes_and_seeds_that_are_none_are_refused(options):
+    data = dataset(2)
+    with pytest.raises(ob.InputError):
+        ob.predict(small_model("gru", data), data, **options)
 
 
 def test_nothing_of_a_prediction_needs_a_gradient():

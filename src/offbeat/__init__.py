@@ -15,7 +15,7 @@ from offbeat.errors import (
 )
 
 if TYPE_CHECKING:
-    from offbeat.answers.forecast import forecast
+    from offbeat.answers.forecast import extrapolate, forecast
     from offbeat.answers.impute import fit_two_sided, impute, load_two_sided, save_two_sided
     from offbeat.answers.predict import predict
     from offbeat.answers.scoring import score_forecast, score_imputation
@@ -62,6 +62,7 @@ _HOMES = {
     "delta": "data.batch",
     "evaluate": "evaluation",
     "export_onnx": "export.exporter",
+    "extrapolate": "answers.forecast",
     "fit": "training",
     "fit_two_sided": "answers.impute",
     "forecast": "answers.forecast",
@@ -118,6 +119,7 @@ __all__ = [
     "delta",
     "evaluate",
     "export_onnx",
+    "extrapolate",
     "fit",
     "fit_two_sided",
     "forecast",

@@ -1,4 +1,4 @@
-"""Going on after the last row."""
+"""Forecasts: predictions after the last row."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.answers.predict import predict
+from offbeat.answers.predict import increasing_seconds, predict
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
 from offbeat.models.model import Model
@@ -19,7 +19,7 @@ def forecast(model: Model, dataset: Dataset, horizons: ArrayLike) -> Dataset:
     Args:
         model: trained.
         dataset: what was observed.
-        horizons: s after the last row, above 0, strictly increasing.
+        horizons: s after the last row: one number, or several that increase strictly, above 0.
 
     Returns:
         One trajectory of predictions per trajectory, in original units, on the clock of the data;
@@ -27,7 +27,7 @@ def forecast(model: Model, dataset: Dataset, horizons: ArrayLike) -> Dataset:
 
     Raises:
         InputError: horizons that are not above 0 or do not increase, other channels than the
-            model's, or a model that can't be asked for times.
+            model's, or a model that cannot predict at any time.
     """
     after = checked_horizons(horizons)
     times = [t.times[-1] + after for t in dataset]
@@ -39,20 +39,19 @@ def forecast(model: Model, dataset: Dataset, horizons: ArrayLike) -> Dataset:
     )
 
 
+extrapolate = forecast
+"""The name of `forecast` in 0.1, kept as an alias."""
+
+
 def checked_horizons(horizons: ArrayLike) -> NDArray[np.float64]:
     """Returns horizons as an array.
 
     Raises:
         InputError: they are not above 0, finite and strictly increasing.
     """
-    try:
-        after = np.atleast_1d(np.asarray(horizons, dtype=np.float64))
-    except (TypeError, ValueError):
-        raise InputError(f"horizons must be numbers of seconds, got {horizons!r}") from None
-    fine = after.ndim == 1 and len(after) and np.isfinite(after).all() and after[0] > 0
-    if not fine or (np.diff(after) <= 0).any():
+    after = increasing_seconds(horizons, "horizons")
+    if after[0] <= 0:
         raise InputError(
-            f"horizons must be seconds above 0 that increase, got {after.tolist()}; "
-            "such as [0.1, 0.5, 1.0]"
+            f"horizons must be above 0 s, got {after[0]:g}; a forecast starts after the last row"
         )
     return after

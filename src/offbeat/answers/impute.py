@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from offbeat.answers.fill_rule import FillRule
-from offbeat.answers.predict import predict
+from offbeat.answers.predict import in_model_order, predict
 from offbeat.answers.two_sided import (
     TwoSided,
     fill_two_sided,
@@ -18,7 +18,8 @@ from offbeat.answers.two_sided import (
     reversed_in_time,
 )
 from offbeat.config import TrainConfig
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.transforms import transforms_of
 from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.files import write_json
 from offbeat.models.checkpoint import load_model, save_model
@@ -59,32 +60,41 @@ def impute(
     Raises:
         InputError: other channels than the model's, or two-sided filling asked of a single model.
     """
-    pair = model if isinstance(model, TwoSided) else None
-    mode = mode or ("two_sided" if pair else "causal")
-    one_of("mode", mode, MODES)
     forward = model.forward if isinstance(model, TwoSided) else model
-    if mode == "two_sided" and pair is None:
-        raise InputError(
-            "filling from both sides needs a backward model, got a single one; train with "
-            "two_sided (offbeat train --two_sided true, or fit_two_sided), or fill 'causal'"
-        )
-    if dataset.names != forward.names and set(dataset.names) == set(forward.names):
-        dataset = dataset.select(forward.names)
-    if mode == "two_sided" and pair is not None:
-        fills = fill_two_sided(pair, dataset, seed=seed)
+    mode = mode or ("two_sided" if isinstance(model, TwoSided) else "causal")
+    one_of("mode", mode, MODES)
+    transforms = transforms_of(forward)
+    dataset = in_model_order(forward, dataset)
+    applied = transforms.apply(dataset)
+    if mode == "causal":
+        fills = [t.values for t in predict(forward, applied, seed=seed)]
+    elif isinstance(model, TwoSided):
+        fills = fill_two_sided(model, applied, seed=seed)
     else:
-        fills = [t.values for t in predict(forward, dataset, seed=seed)]
-    filled = (
-        replace(
-            t,
-            values=np.where(t.observed, t.values, values),
-            names=forward.names,
-            units=forward.units,
+        raise InputError(
+            "mode 'two_sided' needs a backward model, got a single model; train both with "
+            "fit_two_sided (offbeat train --two_sided true), or fill with mode 'causal'"
         )
-        for t, values in zip(dataset, fills, strict=True)
+    filled = Dataset(
+        tuple(
+            Trajectory(t.times, values, names=forward.names, units=forward.units)
+            for t, values in zip(applied, fills, strict=True)
+        ),
+        {**dataset.meta, "filled_by": forward.config.name, "filled": mode},
     )
-    meta = {**dataset.meta, "filled_by": forward.config.name, "filled": mode}
-    return Dataset(tuple(filled), meta)
+    undone = transforms.undo(filled, dataset)
+    return replace(
+        filled,
+        trajectories=tuple(
+            replace(
+                given,
+                values=np.where(given.observed, given.values, t.values),
+                names=forward.names,
+                units=forward.units,
+            )
+            for t, given in zip(undone, dataset, strict=True)
+        ),
+    )
 
 
 def fit_two_sided(
@@ -117,6 +127,8 @@ def fit_two_sided(
         DivergenceError: as `fit`.
     """
     folder = Path(out) if out is not None else None
+    # What is reversed must be continuous already: a wrap is found from the past alone.
+    train, validation = (transforms_of(model).apply(part) for part in (train, validation))
     ahead = fit(model, train, validation, config, out=folder, progress=progress)
     back = make_model(model.config, reversed_in_time(train), scaler=model.scaler, seed=seed)
     back.to(model.dtype)

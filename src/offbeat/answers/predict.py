@@ -1,7 +1,8 @@
-"""Inference: predictions at any times, in original units."""
+"""Predictions at any times, in original units."""
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,45 +10,61 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.config import check_seed
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError
 from offbeat.models.model import Model
+
+Times = ArrayLike | Sequence[ArrayLike]
 
 
 def predict(
     model: Model,
     dataset: Dataset,
     *,
-    times: ArrayLike | Sequence[ArrayLike] | None = None,
+    times: Times | None = None,
     seed: int = 0,
     size: int = 500,
 ) -> Dataset:
-    """Predicts each trajectory at asked times, each from what was observed strictly before it.
+    """Predicts each trajectory at any times, each from what was observed strictly before it.
+
+    The model's input transforms are applied to the data and undone on the predictions: an angle
+    that was given wrapped is predicted wrapped.
 
     Args:
         model: trained.
-        dataset: what was observed; hidden cells are not looked at.
-        times: s, on the clock of the trajectories, strictly increasing: one array for all, or one
-            per trajectory. By default the times of each trajectory's own rows: one step ahead.
+        dataset: what was observed; masked values are not used.
+        times: s, on the clock of the trajectories, strictly increasing: one time or one array for
+            all trajectories, or one array per trajectory. By default the times of each
+            trajectory's own rows: one step ahead.
         seed: of the generator of self-feeding.
-        size: trajectories at a time.
+        size: trajectories per batch.
 
     Returns:
-        One trajectory of predictions per trajectory, in original units, at the asked times; its
-        channels stand in the order of the model.
+        One trajectory of predictions per trajectory, in original units, at the times asked for;
+        its channels are in the order of the model.
 
     Raises:
-        InputError: other channels than the model's, times that do not increase, or a model that
-            can't be asked for times (the oddities that `thesis_config` asks for).
+        InputError: other channels than the model's, times that are not finite numbers in
+            increasing order, or a model that cannot predict at any time (see
+            `thesis_config`).
     """
+    check_seed(seed)
+    if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+        raise InputError(f"size must be a number of trajectories of at least 1, got {size!r}")
     if times is not None:
-        _check_askable(model)
-    asked = _asked(dataset, times)
+        _check_any_time(model)
+    asked = [t.times for t in dataset] if times is None else _times_of_each(times, len(dataset))
+    transforms = transforms_of(model)
+    applied = transforms.apply(dataset)
     results: list[Trajectory] = []
     for first in range(0, len(dataset), size):
-        part = dataset[first : first + size]
-        merged = [_merge(t, at) for t, at in zip(part, asked[first : first + size], strict=True)]
-        batch = model.batch(Dataset(tuple(t for t, _ in merged)))
+        part = applied[first : first + size]
+        merged = [
+            _with_rows_at(t, at) for t, at in zip(part, asked[first : first + size], strict=True)
+        ]
+        batch = model.batch(replace(part, trajectories=tuple(t for t, _ in merged)))
         # The same generator for each part, as if they were one batch.
         generator = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
         with torch.inference_mode():
@@ -62,62 +79,83 @@ def predict(
                     origin=trajectory.origin,
                 )
             )
-    return Dataset(tuple(results), {"predicted_by": model.config.name})
+    return transforms.undo(Dataset(tuple(results), {"predicted_by": model.config.name}), dataset)
 
 
-def _check_askable(model: Model) -> None:
-    """An asked time is a row in which nothing is observed; it must change no other prediction."""
+def in_model_order(model: Model, dataset: Dataset) -> Dataset:
+    """The data set with its channels in the order of the model; as it is where they differ."""
+    same = set(dataset.names) == set(model.names)
+    return dataset.select(model.names) if same and dataset.names != model.names else dataset
+
+
+def increasing_seconds(value: ArrayLike, what: str) -> NDArray[np.float64]:
+    """Returns one number or several, in s, as an array.
+
+    Args:
+        value: a number, or a list or array of numbers.
+        what: it is, for the message.
+
+    Raises:
+        InputError: it is not; it is empty, not finite, or does not increase strictly.
+    """
+    try:
+        array = np.atleast_1d(np.asarray(value))
+    except (TypeError, ValueError):  # lists of different lengths
+        array = np.empty((0, 0))
+    if array.ndim == 1 and (array.dtype.kind in "iuf" or not array.size):
+        seconds = array.astype(np.float64)
+        if len(seconds) and np.isfinite(seconds).all() and (np.diff(seconds) > 0).all():
+            return seconds
+    raise InputError(
+        f"{what} must be one number of seconds or several that are finite and increase strictly, "
+        f"got {' '.join(reprlib.repr(value).split())}; give them such as 0.5 or [0.1, 0.5]"
+    )
+
+
+def _times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
+    """(times,) s of each trajectory."""
+    if hasattr(times, "__array__"):
+        times = np.atleast_1d(np.asarray(times))
+    nested = isinstance(times, list | tuple | np.ndarray) and any(np.ndim(t) for t in times)
+    if not nested:
+        return [increasing_seconds(times, "times")] * count  # type: ignore[arg-type]
+    each: list[ArrayLike] = list(times)  # type: ignore[arg-type]
+    if len(each) != count:
+        raise InputError(
+            f"got times for {len(each)} trajectories, the data has {count}; give one array for "
+            "all, or one per trajectory"
+        )
+    return [increasing_seconds(at, f"times of trajectory {i}") for i, at in enumerate(each)]
+
+
+def _check_any_time(model: Model) -> None:
+    """A time asked for is a row in which nothing is observed; it must change no other prediction.
+
+    Raises:
+        InputError: it would.
+    """
     for field, value, meaning in (
         ("readout", "last_row", "predicts the next row, whenever it comes"),
-        ("update_rows", "every", "is changed by every row, and an asked time is one more row"),
-        ("decay_rows", "every_row", "decays at every row, and an asked time is one more row"),
-        ("time_input", "gap", "looks at the gap since the row before, which an asked time cuts"),
-        ("clock", "first_row", "starts at the first row, and an asked time can come before it"),
+        ("update_rows", "every", "is changed by every row, and a time asked for is one more row"),
+        ("decay_rows", "every_row", "decays at every row, and a time asked for is one more row"),
+        ("time_input", "gap", "uses the gap since the row before, which a time asked for splits"),
+        ("clock", "first_row", "starts at the first row, and a time asked for can come before it"),
+        ("self_feeding", True, "draws a random number at every row, also at a time asked for"),
     ):
-        if getattr(model.config, field) == value:
+        found = getattr(model.config, field)
+        if found == value or (value is True and found):
             raise InputError(
-                f"a model with {field}={value!r} {meaning}: it can't be asked for times; leave "
-                f"times out, or train one with another {field}"
+                f"a model with {field}={found!r} {meaning}: it can't predict at other times than "
+                f"those of its rows; leave times out, or train one with another {field}"
             )
-    if model.config.self_feeding:
-        raise InputError(
-            "a model with self_feeding draws a coin at every row, and an asked time is one more "
-            "row: it can't be asked for times; leave times out, or train one without self_feeding"
-        )
 
 
-def _asked(
-    dataset: Dataset, times: ArrayLike | Sequence[ArrayLike] | None
-) -> list[NDArray[np.float64]]:
-    if times is None:
-        return [t.times for t in dataset]
-    try:
-        shared = np.asarray(times, dtype=np.float64)
-        each = [shared] * len(dataset) if shared.ndim == 1 else [np.asarray(t) for t in shared]
-    except ValueError:  # one array per trajectory, of different lengths
-        each = [np.asarray(t, dtype=np.float64) for t in times]  # type: ignore[union-attr]
-    if len(each) != len(dataset):
-        raise InputError(
-            f"got times for {len(each)} trajectories, the data has {len(dataset)}; give one array "
-            "for all, or one per trajectory"
-        )
-    for i, at in enumerate(each):
-        if at.ndim == 1 and not len(at):
-            raise InputError(f"no time is asked of trajectory {i}; give at least one")
-        if at.ndim != 1 or not np.isfinite(at).all() or (np.diff(at) <= 0).any():
-            raise InputError(
-                f"times asked of trajectory {i} must be finite and increase strictly, got "
-                f"{np.array2string(at, threshold=6, separator=', ')}"
-            )
-    return each
-
-
-def _merge(
-    trajectory: Trajectory, asked: NDArray[np.float64]
+def _with_rows_at(
+    trajectory: Trajectory, times: NDArray[np.float64]
 ) -> tuple[Trajectory, NDArray[np.int64]]:
-    """The trajectory with rows added at the asked times, in which nothing is known."""
-    union = np.union1d(trajectory.times, asked)
-    rows = np.searchsorted(union, asked)
+    """The trajectory with a row at each of the times, new ones empty; and which rows they are."""
+    union = np.union1d(trajectory.times, times)
+    rows = np.searchsorted(union, times)
     if len(union) == trajectory.rows:
         return trajectory, rows
     own = np.searchsorted(union, trajectory.times)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
-from offbeat.answers.predict import predict
+from offbeat.answers.predict import in_model_order, predict
 from offbeat.answers.two_sided import TwoSided
 from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError
 from offbeat.models.model import Model
 
@@ -241,8 +242,7 @@ def score_imputation(
         InputError: nothing is hidden, or other channels than the model's.
     """
     forward = model.forward if isinstance(model, TwoSided) else model
-    if dataset.names != forward.names and set(dataset.names) == set(forward.names):
-        dataset = dataset.select(forward.names)
+    dataset = transforms_of(forward).apply(in_model_order(forward, dataset))
     if not any(masked_values(t).any() for t in dataset):
         raise InputError(
             "no cell is known and hidden, so no fill can be scored; hide some with thin "
@@ -288,8 +288,9 @@ def score_forecast(
         InputError: horizons as of `extrapolate`, no row can be scored, other channels than the
             model's, or a model that can't be asked for times.
     """
-    if dataset.names != model.names and set(dataset.names) == set(model.names):
-        dataset = dataset.select(model.names)
+    dataset = transforms_of(model).apply(in_model_order(model, dataset))
+    if isinstance(targets, bool) or not isinstance(targets, int) or targets < 1:
+        raise InputError(f"targets must be a number of rows of at least 1, got {targets!r}")
     mean = training_mean(model)
     results = []
     after: list[float] = checked_horizons(horizons).tolist()
@@ -298,7 +299,7 @@ def score_forecast(
         name = f"extrapolation, {horizon:g} s"
         sums = _sums_for(model)
         if tasks:
-            pasts = Dataset(tuple(past for past, _, _, _ in tasks))
+            pasts = replace(dataset, trajectories=tuple(past for past, _, _, _ in tasks))
             asked = [np.array([at]) for _, at, _, _ in tasks]
             predicted = predict(model, pasts, times=asked)
             for (past, at, truth, counted), said in zip(tasks, predicted, strict=True):

@@ -37,10 +37,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.answers.fill_rule import FillRule, NormalEquations
-from offbeat.answers.predict import predict
+from offbeat.answers.predict import in_model_order, predict
 from offbeat.baselines import fill
 from offbeat.data.masking import mask_out, masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError
 from offbeat.models.model import Model
 
@@ -123,8 +124,7 @@ def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int 
         validation: where nothing of it is hidden, 30 % of the cells of each channel are, at random.
         seed: of that draw, and of the generator of self-feeding.
     """
-    if validation.names != forward.names:
-        validation = validation.select(forward.names)
+    validation = transforms_of(forward).apply(in_model_order(forward, validation))
     if not any(masked_values(t).any() for t in validation):
         validation = mask_out(validation, 0.7, hide="cells", seed=seed)
     scale = np.abs(forward.scaler.scale) * np.array(forward.statistics.std)

@@ -381,7 +381,7 @@ def _continuous(four: Values, observed: Mask) -> tuple[Values, Mask]:
     hidden = ~observed.any(axis=1)
     nearest = unit[at[np.maximum(after, 0)]] * signs[np.maximum(after, 0), None]
     sign = np.where(hidden, np.where((unit * nearest).sum(axis=1) < 0, -1.0, 1.0), sign)
-    whole: Mask = hidden | observed.all(axis=1)  # else its length is not known
+    whole = np.asarray(hidden | observed.all(axis=1))  # else its length is not known
     return np.where(whole[:, None], unit, four) * sign[:, None], observed
 
 
@@ -422,3 +422,9 @@ def _unit(four: Values) -> Values:
     length = _length(four)
     keep = (np.abs(length - 1) <= _UNIT_LENGTH) | ~(length > _NO_LENGTH)
     return four / np.where(keep, 1.0, length)[:, None]
+
+
+def transforms_of(model: object) -> Transforms:
+    """The transforms of a model; those of one that has none change nothing."""
+    found = getattr(model, "transforms", None)
+    return found if isinstance(found, Transforms) else Transforms.identity()
