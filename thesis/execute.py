@@ -171,7 +171,7 @@ def _comparable(kept: Any, keys: Iterable[str]) -> dict[str, Any]:
 
 
 def _rows_0(model: Model, test: Dataset) -> dict[str, float]:
-    """The constant c of the hidden first rows, and their share."""
+    """The constant c of the masked first rows, and their fraction."""
     batch = model.batch(test)
     hidden = ~batch.mask[:, 0].any(dim=1)
     return {

@@ -56,13 +56,13 @@ def illustrate(
 
     Args:
         checkpoints: by model label, a folder that `load_model` reads; may be empty.
-        observed_fraction: share of the rows that models are shown.
+        observed_fraction: fraction of the rows that models are shown.
         robot: one of `offbeat.data.robots.ROBOTS`.
         recordings: trajectories to keep as they are, the first of the protocol's data.
         recorded_rows: rows per simulated trajectory.
         window: rows that models see.
         state_seed: of the recordings' initial states, the protocol's.
-        fresh_seed: of the trajectories that models see, of windows and of hidden rows.
+        fresh_seed: of the trajectories that models see, of windows and of masked rows.
         trajectories: in the map of hidden states.
         every: rows between two points of the map along a trajectory.
         progress: show a progress bar of the simulation.
@@ -117,12 +117,12 @@ def illustrate(
 
 
 def checkpoints_of(runs: str | Path, observed_fraction: float) -> dict[str, Path]:
-    """One trained model per label, of the first repeat at an observed share.
+    """One trained model per label, of the first repeat at an observed fraction.
 
     Args:
         runs: folder of a reproduction, whose runs lie in `runs/e1-ode_rnn-30-r00/training` and the
             like. Where experiment 1 has no checkpoint of a label, that of experiment 2 is taken.
-        observed_fraction: share of the rows.
+        observed_fraction: fraction of the rows.
 
     Returns:
         Folders that `load_model` reads, by label; empty where nothing was kept.

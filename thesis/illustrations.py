@@ -66,7 +66,7 @@ class Illustrations:
         units: of the channels.
         times: (rows,) s.
         recordings: (trajectories, rows, channels) in the channels' units.
-        fraction: observed share of the rows in `trace` and `map`; NaN without models.
+        fraction: observed fraction of the rows in `trace` and `map`; NaN without models.
         runs: by model, the run whose checkpoint was used.
         trace: hidden states along one trajectory, or None without models.
         map: hidden states of many, or None without models or without umap-learn.

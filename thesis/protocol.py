@@ -41,7 +41,7 @@ class Run:
     Attributes:
         experiment: 1, learning curves (section 3.2), or 2, repeats (section 3.3).
         model: label, one of `MODELS`.
-        observed_fraction: share of the rows that stay observed.
+        observed_fraction: fraction of the rows that stay observed.
         repeat: counted from 0.
         epochs: passes over the training part.
         seed_draw: of windows, masks, split, order of the batches and generator. It follows from
@@ -78,8 +78,8 @@ class Protocol:
         state_seed: of the initial states: the seed of the public generator of the lost file.
         window: consecutive rows cut out of each trajectory, the start drawn (section 3.1).
         scaler: normalisation `(x - min) / max` over all rows (section 3.1).
-        parts: shares of training, validation and test trajectories (section 3.1).
-        observed_fractions: observed shares of the rows (section 3.1; tables 3.1 to 3.6).
+        parts: fractions of training, validation and test trajectories (section 3.1).
+        observed_fractions: observed fractions of the rows (section 3.1; tables 3.1 to 3.6).
         hidden_size: units of the hidden state, all models of the thesis (section 3.2).
         decoder_units: hidden layers of the decoder, tanh between (OutputNN, section 3.2).
         field_units: hidden layers of the ODE function, tanh between (ODEFunc, section 3.2).
@@ -93,7 +93,7 @@ class Protocol:
         epochs_of_curves: of experiment 1 (section 3.2; tables 3.1 to 3.5, figures 3.3 to 3.6).
         repeats: of experiment 2 (section 3.3; table 3.6, figures 3.7 to 3.10).
         epochs_of_repeats: of experiment 2 for each of `observed_fractions` (section 3.3).
-        self_feeding: share of rows at which the GRU and GRU-D of the thesis' rows are fed their
+        self_feeding: fraction of rows at which the GRU and GRU-D of the thesis' rows are fed their
             own predictions (inferred, `docs/deviations.md`).
         anchored_hidden_size: units of h in the anchored model, which is ours, as all that follows.
         anchored_field_units: hidden layers of its ODE function, SiLU between.
@@ -147,7 +147,7 @@ class Protocol:
         fine = all(0 < fraction <= 1 for fraction in self.observed_fractions)
         if not percents or not fine or len(set(percents)) != len(percents):
             raise InputError(
-                "observed_fractions must be shares above 0 and at most 1 that differ by a percent "
+                "observed_fractions must be above 0 and at most 1 that differ by a percent "
                 f"or more, got {self.observed_fractions}"
             )
         if not 1 <= self.repeats <= 100:

@@ -1,7 +1,7 @@
 """Where numbers come from: the commit, the processor and the libraries of this process.
 
 Sums in another order end in other last digits, and training lets them grow. So runs that were made
-by code that adds otherwise, on another kind of processor or by another scan backend are told apart.
+by code that adds in another order, on another processor or by another scan backend are marked.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ from offbeat.files import atomic_folder, write_json
 from thesis.execute import TRAINING
 from thesis.protocol import Protocol
 from thesis.provenance import Provenance
-from thesis.record import GROUP, Record
-from thesis.session import read_sittings
+from thesis.record import GROUP, SESSIONS, Record
+from thesis.session import read_sessions
 
 ABOUT = "about.json"
 _PACKAGES = ("torch", "numpy", "scipy", "mujoco", "dm_control", "pyarrow")
@@ -30,12 +30,12 @@ def publish(
 ) -> None:
     """Copies the record of an experiment, with all that belongs to it, to a folder to commit.
 
-    What stands there is added to, never thrown away: the sittings and models of another machine
+    What stands there is added to, never thrown away: the sessions and models of another machine
     stay.
 
     Args:
         out: folder of the experiment.
-        to: folder to write: record and curves, `about.json` (protocol, sittings with their wall
+        to: folder to write: record and curves, `about.json` (protocol, sessions with their wall
             time, machine, versions, command, and how many runs were made by what), and under
             `models/` the weights of ODE-RNN and ODE-GRU-D in experiment 1.
         protocol: of the experiment.
@@ -60,10 +60,10 @@ def _about(
         before = json.loads((to / ABOUT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         before = {}
-    lines = [*before.get("sittings", []), *read_sittings(out / "sittings.json")]
+    lines = [line for name in SESSIONS for line in before.get(name, [])] + read_sessions(out)
     # Two short ones may begin within one second.
-    sittings = {(line["began_at"], line["seconds"]): line for line in lines}
-    ordered = [sittings[began] for began in sorted(sittings)]
+    sessions = {(line["began_at"], line["seconds"]): line for line in lines}
+    ordered = [sessions[began] for began in sorted(sessions)]
     typed = [*before.get("commands", []), list(command)]
     commands = [line for line in map(_without_budget, typed) if line]
     return {
@@ -71,7 +71,7 @@ def _about(
         "runs_done": len(record.runs),
         "runs_total": len(protocol.runs()),
         "seconds_of_runs": sum(row["seconds"] for row in record.runs.values()),
-        "seconds_of_sittings": sum(line["seconds"] for line in ordered),
+        "seconds_of_sessions": sum(line["seconds"] for line in ordered),
         "made_by": [
             {**dict(zip(GROUP, group, strict=True)), "runs": count}
             for group, count in record.groups().items()
@@ -83,7 +83,7 @@ def _about(
             "python": platform.python_version(),
             "packages": {name: _version(name) for name in _PACKAGES},
         },
-        "sittings": ordered,
+        "sessions": ordered,
         "protocol": asdict(protocol),
     }
 

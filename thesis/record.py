@@ -81,6 +81,9 @@ LOG_COLUMNS: dict[str, str] = {
 GROUP = ("bits", "cpu", "kernel_body", "torch", "data")
 """Runs that agree in these were made alike; those that do not are never mixed in silence."""
 
+SESSIONS = ("sessions", "sittings")
+"""Name of the list of sessions, here and in version 0.1.0."""
+
 _TABLES = {"record": RUN_COLUMNS, "curves": CURVE_COLUMNS}
 
 

@@ -27,8 +27,8 @@ def report_command(
     Args:
         runs: folder of a reproduction, with record.parquet or record.csv.
         out: folder for report.html, summary.md, tables/ and figures/.
-        observed_fraction: share of the rows at which hidden states are shown; the models are those
-            of experiment 1 at this share, and of experiment 2 where experiment 1 has none.
+        observed_fraction: fraction of the rows at which hidden states are shown; the models are
+            those of experiment 1 at this fraction, and of experiment 2 where experiment 1 has none.
         illustrate: where neither runs nor out has illustrations.npz of these models, make it in
             out, by simulation and from the checkpoints of the runs; needs the extra sim, and umap
             for the map of hidden states.

@@ -44,7 +44,7 @@ def run_command(
         engine_options: as JSON; for ray, arguments of ray.init, for slurm of submitit's
             update_parameters.
         publish: folder to copy the record to when this call ends, for a commit: record, curves,
-            about.json (machine, versions, wall time of each sitting) and the eight models of
+            about.json (machine, versions, wall time of each session) and the eight models of
             ODE-RNN and ODE-GRU-D in experiment 1.
         json: print what was done as JSON.
     """

@@ -1,4 +1,4 @@
-"""A sitting of an experiment: tasks go to an engine, finished runs into the record."""
+"""A session of an experiment: tasks go to an engine, finished runs into the record."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from thesis.execute import Task
 from thesis.progress import Progress, duration, seconds_left
 from thesis.protocol import Run
 from thesis.provenance import cpu
-from thesis.record import Record, Row, group_of, group_text
+from thesis.record import SESSIONS, Record, Row, group_of, group_text
 
 _ATTEMPTS = 3
 
@@ -28,7 +28,7 @@ def curve_of(task: Task) -> tuple[Row, ...]:
 
 
 class Session:
-    """One sitting: gives tasks to an engine and writes the record run by run.
+    """One session: gives tasks to an engine and writes the record run by run.
 
     Args:
         out: folder of the record.
@@ -57,7 +57,7 @@ class Session:
         self.attempts: dict[str, int] = {}
         self.diverged: list[str] = []
         self.groups = {*record.groups(), here}
-        self.sitting = _Sitting(out / "sittings.json", engine.description)
+        self.session = _SessionFile(out, engine.description)
 
     def run(
         self, tasks: Iterable[Task], *, asked: Iterable[Run], deadline: float | None = None
@@ -93,7 +93,7 @@ class Session:
                     else:
                         raise OffbeatError(
                             f"{ending.failure.message}; what is done is kept, the same command "
-                            "goes on once this is mended"
+                            "goes on once this is repaired"
                         )
                 self._show()
             if self.running:
@@ -138,7 +138,7 @@ class Session:
             )
         self.record = self.record.with_run(row, curve_of(task)).in_order(self.order)
         self.record.write(self.out)
-        self.sitting.update(row["run_id"])
+        self.session.update(row["run_id"])
         group = group_of(row)
         if group not in self.groups:
             self.groups.add(group)
@@ -167,7 +167,7 @@ class Session:
     def _show(self, *, now: bool = False) -> None:
         if not (now or self.shown.due()):
             return
-        self.sitting.update()
+        self.session.update()
         self.shown.update(
             done=self._done(),
             total=len(self.asked),
@@ -177,15 +177,15 @@ class Session:
         )
 
 
-class _Sitting:
-    """What a call did, and how long it lasted: the last line of `sittings.json`.
+class _SessionFile:
+    """What a call did, and how long it lasted: the last line of `sessions.json`.
 
     It is written again and again, so that a call that is killed is counted up to its end.
     """
 
-    def __init__(self, path: Path, engine: str) -> None:
-        self.path = path
-        self.before = read_sittings(path)
+    def __init__(self, folder: Path, engine: str) -> None:
+        self.path = folder / "sessions.json"
+        self.before = read_sessions(folder)
         self.began = time.monotonic()
         self.line: dict[str, Any] = {
             "began_at": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -202,9 +202,11 @@ class _Sitting:
         write_json(self.path, [*self.before, self.line])
 
 
-def read_sittings(path: Path) -> list[dict[str, Any]]:
+def read_sessions(folder: Path) -> list[dict[str, Any]]:
     """When the calls that made a record began, how long they lasted, what they did."""
-    try:
-        return list(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return []
+    for name in SESSIONS:
+        try:
+            return list(json.loads((folder / f"{name}.json").read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            continue
+    return []

@@ -29,7 +29,7 @@ HONEST = {
     "gru_unfed": 0.00094,
     "gru_d_unfed": 0.00088,
 }
-"""Honest MSE at 30 %; it falls in proportion to the hidden share."""
+"""Honest MSE at 30 %; it falls in proportion to the masked fraction."""
 HALVING = {"gru": 40, "gru_d": 36, "ode_rnn": 30, "ode_gru_d": 12}
 """Epochs in which what is left to learn halves."""
 CONSTANT = 1.13
@@ -61,7 +61,7 @@ def synthetic(
 
 
 def draw_of(seed, experiment, fraction, repeat):
-    """What all models of a repeat share: how hard the draw is, and its hidden first rows."""
+    """What all models of a repeat share: how hard the draw is, and its masked first rows."""
     random = np.random.default_rng([seed, experiment, round(100 * fraction), repeat])
     return {
         "hardness": np.exp(0.03 * random.standard_normal()),

@@ -161,36 +161,36 @@ def test_wall_time_counts_what_overlaps_once_and_pauses_not_at_all(record):
     assert circumstances.wall_hours(made.changed(few, 0, finished_at="soon")) is None
 
 
-def test_the_folder_tells_repeats_and_sittings(tmp_path):
+def test_the_folder_tells_repeats_and_sessions(tmp_path):
     (tmp_path / "protocol.json").write_text(json.dumps({"repeats": 3}))
-    sittings = [{"seconds": 60.0, "engine": "2 processes"}, {"seconds": 30, "engine": "ray"}]
-    (tmp_path / "sittings.json").write_text(json.dumps(sittings))
+    sessions = [{"seconds": 60.0, "engine": "2 processes"}, {"seconds": 30, "engine": "ray"}]
+    (tmp_path / "sessions.json").write_text(json.dumps(sessions))
     told = Circumstances.of(tmp_path)
-    assert (told.repeats, told.sittings_s, told.engines) == (3, 90.0, ("2 processes", "ray"))
+    assert (told.repeats, told.sessions_s, told.engines) == (3, 90.0, ("2 processes", "ray"))
 
 
 def test_a_published_record_tells_the_same_and_its_commands(tmp_path):
     about = {
         "protocol": {"repeats": 4},
-        "sittings": [{"seconds": 5.0, "engine": "local"}],
+        "sessions": [{"seconds": 5.0, "engine": "local"}],
         "commands": [["offbeat", "reproduce", "--tiny"]],
         "here": {"cores": 2, "platform": "Linux", "packages": {"scipy": "1.17.1"}},
     }
     (tmp_path / "about.json").write_text(json.dumps(about))
     told = Circumstances.of(tmp_path)
-    assert (told.repeats, told.sittings_s) == (4, 5.0)
+    assert (told.repeats, told.sessions_s) == (4, 5.0)
     assert told.commands == ("offbeat reproduce --tiny",)
     assert dict(told.machine) == {"platform": "Linux", "cores": "2", "scipy": "1.17.1"}
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[1]", '"x"', "{", '{"sittings": 3, "here": [], "commands": 1}']
+    "text", ["", "[1]", '"x"', "{", '{"sessions": 3, "here": [], "commands": 1}']
 )
 def test_a_damaged_file_beside_the_record_is_left_out(tmp_path, text):
-    for name in ("protocol.json", "sittings.json", "about.json"):
+    for name in ("protocol.json", "sessions.json", "about.json"):
         (tmp_path / name).write_text(text)
     told = Circumstances.of(tmp_path)
-    assert (told.repeats, told.sittings_s, told.commands, told.machine) == (10, None, (), ())
+    assert (told.repeats, told.sessions_s, told.commands, told.machine) == (10, None, (), ())
 
 
 @pytest.mark.parametrize(

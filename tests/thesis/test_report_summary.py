@@ -80,12 +80,14 @@ def test_the_constant_is_that_of_the_record(contents, text):
     at = record.where(experiment=2, model="ode_gru_d", fraction=0.3)
     own = made.CONSTANT * record.values("hidden_rows_0_share", at) / 100
     mse = record.values("published_mse", at)
-    (cells,) = rows(text, "Its share of the published MSE of ODE-GRU-D, ours")
+    (cells,) = rows(text, "Its fraction of the published MSE of ODE-GRU-D, ours")
     assert cells[3] == f"{100 * np.mean(own / mse):.0f}{PERCENT}"
     (spread,) = rows(text, "The same, if nothing but the constant varied")
     rest = (mse - own).mean()
     assert spread[3] == f"{np.sqrt(own + rest).std(ddof=1):.4f}"
-    (inferred,) = rows(text, "Its share of the squared RMSE of ODE-GRU-D in the thesis (inferred)")
+    (inferred,) = rows(
+        text, "Its fraction of the squared RMSE of ODE-GRU-D in the thesis (inferred)"
+    )
     assert inferred[0] == f"{100 * made.CONSTANT * 0.1 / 100 / 0.0369**2:.0f}{PERCENT}"
 
 
@@ -111,7 +113,7 @@ def test_the_spread_that_the_constant_makes_is_held_against_the_inference(conten
 def test_few_repeats_are_called_few(text):
     assert "a verdict can still change" not in text
     few = summary(contents_of(made.synthetic(repeats=4, epochs=60), repeats=10))
-    assert "So far a model has 4 of 10 repeats at a share" in few
+    assert "So far a model has 4 of 10 repeats at a fraction" in few
 
 
 def test_what_is_inferred_is_called_so_and_commands_are_there(text):
@@ -222,7 +224,9 @@ def test_epochs_of_a_known_curve_are_those_of_its_closed_form(falling):
 
 
 def test_a_curve_that_still_falls_is_said_to(falling):
-    said = " ".join(convergence.speed_verdicts(falling)["Honest scoring"].evidence)
+    said = " ".join(
+        convergence.speed_verdicts(falling)["Scoring after the first observation"].evidence
+    )
 
     def trend(half):
         epochs = np.arange(66, 76)
@@ -237,7 +241,9 @@ def test_when_one_model_is_as_good_as_the_other_becomes_is_told(falling):
     # 0.00066 (1 + 4 / 2^(e / 12)) falls below 0.00073 (1 + 4 / 2^(75 / 30)).
     end = 0.00073 * (1 + 4 * 0.5 ** (75 / 30))
     epoch = int(np.ceil(12 * np.log2(4 / (end / 0.00066 - 1))))
-    said = " ".join(convergence.speed_verdicts(falling)["Honest scoring"].evidence)
+    said = " ".join(
+        convergence.speed_verdicts(falling)["Scoring after the first observation"].evidence
+    )
     assert f"90{PERCENT}: in 3 of 3 repeats, median epoch {epoch}" in said
 
 
@@ -283,7 +289,7 @@ def test_what_is_left_is_judged_by_what_an_epoch_has_taken():
     # Without a word of the engine: 900 s of runs in the 15 minutes before the last end.
     alone = circumstances.time_left(timed, Circumstances())
     assert alone.at_a_time == pytest.approx(900 / circumstances.wall_hours(timed) / 3600)
-    facts = dict(circumstances.time_facts(timed, Circumstances(engines=("2 processes of x",))))
+    facts = dict(circumstances.time_rows(timed, Circumstances(engines=("2 processes of x",))))
     assert facts["Still to run (estimate)"].startswith("374 runs, about ")
     assert "at 2 runs at a time" in facts["Still to run (estimate)"]
     assert "no run yet of GRU-D" in facts["Basis of the estimate"]
@@ -296,17 +302,17 @@ def test_a_whole_record_has_nothing_left_to_estimate(contents):
     assert circumstances.time_left(contents.record, strange) is None
 
 
-def test_several_sittings_of_several_processes_are_added_up(tmp_path):
-    sittings = [
+def test_several_sessions_of_several_processes_are_added_up(tmp_path):
+    sessions = [
         {"seconds": 3600.0, "engine": "2 processes of 1 thread"},
         {"seconds": 1800.0, "engine": "1 process of 1 thread"},
         {"seconds": 600.0, "engine": "2 processes of 1 thread"},
     ]
-    (tmp_path / "sittings.json").write_text(json.dumps(sittings))
+    (tmp_path / "sessions.json").write_text(json.dumps(sessions))
     known = Circumstances.of(tmp_path)
-    assert (known.sittings, known.sittings_s, known.processes) == (3, 6000.0, 2)
-    facts = dict(circumstances.time_facts(made.synthetic(repeats=1, epochs=2), known))
-    assert facts["Wall time of all sittings"] == "100 min, 3 sittings"
+    assert (known.sessions, known.sessions_s, known.processes) == (3, 6000.0, 2)
+    facts = dict(circumstances.time_rows(made.synthetic(repeats=1, epochs=2), known))
+    assert facts["Wall time of all sessions"] == "100 min, 3 sessions"
 
 
 # --- files ----------------------------------------------------------------------------------------

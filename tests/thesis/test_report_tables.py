@@ -183,7 +183,7 @@ def test_a_curve_table_reads_the_curves_at_the_epochs_of_the_thesis(record):
     table = tables.curve_table(record, 0.5)
     curve = record.curve("e1-ode_rnn-50-r00")
     for scoring, heading in (("published", "Ours, published scoring"), ("honest", None)):
-        cells = rows_of(table, heading or "Ours, honest scoring")["ODE-RNN"]
+        cells = rows_of(table, heading or "Ours, scoring after the first observation")["ODE-RNN"]
         expected = [curve[f"validation_{scoring}_mse"][epoch - 1] for epoch in thesis.EPOCHS]
         assert [cell.value for cell in cells] == expected
 
@@ -192,7 +192,7 @@ def test_the_last_value_stands_in_every_block_of_ours(record):
     run = int(np.flatnonzero(record.runs["run_id"] == "e1-gru-70-r00")[0])
     table = tables.final_table(record)
     for scoring in ("published", "honest"):
-        cells = rows_of(table, f"Ours, {scoring} scoring")["Last value"]
+        cells = rows_of(table, tables.HEADINGS[scoring])["Last value"]
         assert cells[1].value == record.runs[f"last_value_{scoring}_mse"][run]
 
 
@@ -210,7 +210,7 @@ def test_missing_repeats_are_counted_in_the_cell_and_named_below(record):
     gone = (record.runs["model"] == "gru") & (record.runs["repeat"] >= 4)
     gone |= (record.runs["model"] == "gru_d") & (record.runs["experiment"] == 2)
     table = tables.repeats_table(made.without(record, gone), repeats=6)
-    block = rows_of(table, "Ours, honest scoring")
+    block = rows_of(table, "Ours, scoring after the first observation")
     assert block["GRU"][0].text.endswith(" (4 of 6)")
     assert [cell.text for cell in block["GRU-D"]] == ["–"] * 4
     (note,) = [n for n in table.notes if "runs of experiment 2 are there" in n]
@@ -235,7 +235,7 @@ def test_a_number_whose_runs_were_not_made_alike_is_marked_and_no_other(record):
     ]
     assert marked == [
         ("Ours, published scoring", "GRU-D", 0),
-        ("Ours, honest scoring", "GRU-D", 0),
+        ("Ours, scoring after the first observation", "GRU-D", 0),
     ]
     assert any(note.startswith(MIXED) for note in table.notes)
     assert not any(n.startswith(MIXED) for n in tables.repeats_table(record, repeats=6).notes)
@@ -248,7 +248,7 @@ def test_table_3_7_is_shapiro_wilk_on_the_rmse(record):
     table = tables_tests.normality_table(record)
     rows = record.where(experiment=2, model="ode_rnn", fraction=0.5)
     expected = stats.shapiro(np.sqrt(record.values("honest_mse", rows))).pvalue
-    cell = rows_of(table, "Ours, honest scoring")["ODE-RNN"][2]
+    cell = rows_of(table, "Ours, scoring after the first observation")["ODE-RNN"][2]
     assert cell.value == pytest.approx(expected)
     assert [c.value for c in rows_of(table, "Thesis")["ODE-GRU-D"]] == [
         0.0638,
@@ -362,18 +362,18 @@ def test_run_times_are_summed_in_minutes_and_per_step(record):
 
 def test_a_run_has_settled_when_it_stays_within_5_percent_of_its_end(record):
     table = convergence.speed_table(record, number="A.11")
-    cell = rows_of(table, "Experiment 1, honest scoring")["ODE-GRU-D"][3]
+    cell = rows_of(table, "Experiment 1, scoring after the first observation")["ODE-GRU-D"][3]
     curve = record.curve("e1-ode_gru_d-30-r00")["validation_honest_mse"]
     away = np.flatnonzero(curve > 1.05 * curve[-1])
     assert cell.value == away[-1] + 2
-    many = rows_of(table, "Experiment 2, honest scoring")["ODE-GRU-D"][3]
+    many = rows_of(table, "Experiment 2, scoring after the first observation")["ODE-GRU-D"][3]
     assert (many.n, bool(re.fullmatch(r"\d+\.\d \[\d+\.\d, \d+\.\d\]", many.text))) == (6, True)
 
 
 def test_the_spread_table_has_ours_over_the_others(record):
     found = {scoring: stability.spreads(record, scoring) for scoring in findings.SCORINGS}
     table = stability.spread_table(record, found, number="A.10")
-    cell = rows_of(table, "Ours, honest scoring")["ODE-RNN"][0]
+    cell = rows_of(table, "Ours, scoring after the first observation")["ODE-RNN"][0]
     mine, other = (rmse(record, m, 0.9, "honest").std(ddof=1) for m in ("ode_gru_d", "ode_rnn"))
     assert cell.value == pytest.approx(other)
     assert cell.text == f"{other:.5f} ({mine / other:.2f})"

@@ -420,14 +420,14 @@ def test_the_time_left_follows_from_what_an_epoch_of_each_model_has_cost():
     assert seconds_left([fair], {}, rows, capacity=2) == 275
 
 
-def test_the_status_file_and_the_sittings_say_what_was_done(done):
+def test_the_status_file_and_the_sessions_say_what_was_done(done):
     status = json.loads((done / "status.json").read_text(encoding="utf-8"))
     assert status["runs_done"] == status["runs_total"] == len(SMALL.runs())
     assert status["running"] == []
-    (sitting,) = json.loads((done / "sittings.json").read_text(encoding="utf-8"))
-    assert sitting["runs"] == [run.run_id for run in SMALL.runs()]
+    (session,) = json.loads((done / "sessions.json").read_text(encoding="utf-8"))
+    assert session["runs"] == [run.run_id for run in SMALL.runs()]
     spent = sum(row["seconds"] for row in Record.read(done).runs.values())
-    assert spent <= sitting["seconds"] + 0.1
+    assert spent <= session["seconds"] + 0.1
 
 
 # --- what is committed ----------------------------------------------------------------------------
@@ -446,7 +446,7 @@ def test_what_is_published_can_be_gone_on_from_and_keeps_what_stands_there(done,
     assert sorted(path.name for path in (to / "models").iterdir()) == kept
     about = json.loads((to / "about.json").read_text(encoding="utf-8"))
     assert about["runs_done"] == about["runs_total"] == len(SMALL.runs())
-    assert len(about["sittings"]) == 2
+    assert len(about["sessions"]) == 2
     assert about["commands"] == [["offbeat", "reproduce"]]  # a time limit changes no number
     assert sum(group["runs"] for group in about["made_by"]) == len(SMALL.runs())
     assert ob.load_model(to / "models" / kept[0]).config.name == "ode_gru_d"
@@ -493,8 +493,8 @@ def check_nothing_lost_and_nothing_twice(out, process, expected):
     assert numbers(record) == numbers(expected)
     finished = [line for line in said.splitlines() if "published RMSE" in line]
     assert len(finished) == len(expected.runs), said
-    (sitting,) = json.loads((out / "sittings.json").read_text(encoding="utf-8"))
-    assert sorted(sitting["runs"]) == sorted(expected.runs)
+    (session,) = json.loads((out / "sessions.json").read_text(encoding="utf-8"))
+    assert sorted(session["runs"]) == sorted(expected.runs)
     return said
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from offbeat.errors import OffbeatError
 from thesis.protocol import Protocol
+from thesis.record import SESSIONS
 from thesis.report import thesis_numbers as thesis
 from thesis.report.records import PROVENANCE, Record
 from thesis.report.tables import label, percent
@@ -36,30 +37,33 @@ class Circumstances:
 
     Attributes:
         protocol: the fields of the protocol; empty where the folder has none.
-        sittings_s: s, wall time of all sittings together; None where it was not kept.
-        sittings: how many there were.
-        engines: what ran them, each once, that of the last sitting last.
+        sessions_s: s, wall time of all sessions together; None where it was not kept.
+        sessions: how many there were.
+        engines: what ran them, each once, that of the last session last.
         commands: what was typed.
         machine: names and values of what the record itself does not hold.
     """
 
     protocol: Mapping[str, Any] = field(default_factory=dict)
-    sittings_s: float | None = None
-    sittings: int = 0
+    sessions_s: float | None = None
+    sessions: int = 0
     engines: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
     machine: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def of(cls, folder: str | Path) -> Circumstances:
-        """Reads `protocol.json` and `sittings.json`, or `about.json` of a published record.
+        """Reads `protocol.json` and `sessions.json`, or `about.json` of a published record.
 
         What is missing or damaged is left out: the record stands without it.
         """
         folder = Path(folder)
         about = _mapping(_json(folder / "about.json"))
-        sittings = _rows(_json(folder / "sittings.json")) or _rows(about.get("sittings"))
-        spent = [one.get("seconds") for one in sittings]
+        told = [_json(folder / f"{name}.json") for name in SESSIONS]
+        sessions = next(
+            filter(None, map(_rows, [*told, *(about.get(name) for name in SESSIONS)])), []
+        )
+        spent = [one.get("seconds") for one in sessions]
         known = [s for s in spent if isinstance(s, int | float)]
         typed = about.get("commands")
         here = _mapping(about.get("here"))
@@ -70,8 +74,8 @@ class Circumstances:
         return cls(
             _mapping(_json(folder / "protocol.json")) or _mapping(about.get("protocol")),
             float(sum(known)) if known and len(known) == len(spent) else None,
-            len(sittings),
-            _last_of_each(str(one["engine"]) for one in sittings if "engine" in one),
+            len(sessions),
+            _last_of_each(str(one["engine"]) for one in sessions if "engine" in one),
             tuple(" ".join(map(str, c)) for c in typed if isinstance(c, list))
             if isinstance(typed, list)
             else (),
@@ -86,7 +90,7 @@ class Circumstances:
 
     @property
     def processes(self) -> int | None:
-        """Runs at a time of the last sitting, where its engine says so."""
+        """Runs at a time of the last session, where its engine says so."""
         found = re.match(r"(\d+) process", self.engines[-1]) if self.engines else None
         return int(found[1]) if found and int(found[1]) else None
 
@@ -190,7 +194,7 @@ class TimeLeft:
     Attributes:
         runs: how many are missing.
         run_s: s, the sum of their run times: epochs times what an epoch of the model took so far.
-        at_a_time: processes of the last sitting, or runs that went at a time so far, on average
+        at_a_time: processes of the last session, or runs that went at a time so far, on average
             over the time in which any did.
         guessed: models without a finished run; an epoch of theirs is taken to cost as much as the
             mean of all others.
@@ -234,36 +238,36 @@ def time_left(record: Record, circumstances: Circumstances) -> TimeLeft | None:
     )
 
 
-def time_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
+def time_rows(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
     """Time and its split, as names and values; for a part of the protocol, what is left."""
     seconds = record.runs["seconds"].astype(float)
-    facts = [("Runs", f"{len(record)}"), ("Sum of the run times", hours(seconds.sum()))]
+    rows = [("Runs", f"{len(record)}"), ("Sum of the run times", hours(seconds.sum()))]
     for experiment in (1, 2):
         runs = record.where(experiment=experiment)
         if len(runs):
-            facts.append(
+            rows.append(
                 (f"Experiment {experiment}", f"{hours(seconds[runs].sum())}, {len(runs)} runs")
             )
     covered = wall_hours(record)
     if covered is not None:
-        facts.append(("Wall time with at least one run going", hours(3600 * covered)))
-    if circumstances.sittings_s is not None:
-        count = circumstances.sittings
-        said = f"{hours(circumstances.sittings_s)}, {count} sitting{'s' * (count != 1)}"
-        facts.append(("Wall time of all sittings", said))
+        rows.append(("Wall time with at least one run going", hours(3600 * covered)))
+    if circumstances.sessions_s is not None:
+        count = circumstances.sessions
+        said = f"{hours(circumstances.sessions_s)}, {count} session{'s' * (count != 1)}"
+        rows.append(("Wall time of all sessions", said))
     if covered:
-        facts.append(("Runs at a time, on average", f"{seconds.sum() / (3600 * covered):.1f}"))
+        rows.append(("Runs at a time, on average", f"{seconds.sum() / (3600 * covered):.1f}"))
     if circumstances.engines:
-        facts.append(("Ran by", "; ".join(circumstances.engines)))
+        rows.append(("Ran by", "; ".join(circumstances.engines)))
     ended = sorted(str(t) for t in record.runs["finished_at"])
-    facts += [("First run finished", ended[0]), ("Last run finished", ended[-1])]
+    rows += [("First run finished", ended[0]), ("Last run finished", ended[-1])]
     left = time_left(record, circumstances)
     if left is not None:
-        facts += _left_facts(left, float(seconds.sum()))
-    return facts
+        rows += _left_rows(left, float(seconds.sum()))
+    return rows
 
 
-def _left_facts(left: TimeLeft, spent: float) -> list[tuple[str, str]]:
+def _left_rows(left: TimeLeft, spent: float) -> list[tuple[str, str]]:
     said = f"{left.runs} runs, about {hours(left.run_s)} of run time"
     total = f"about {hours(spent + left.run_s)} of run time"
     if left.at_a_time:
@@ -281,22 +285,22 @@ def _left_facts(left: TimeLeft, spent: float) -> list[tuple[str, str]]:
     ]
 
 
-def machine_facts(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
+def machine_rows(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
     """Machine and versions, as names and values, each with the number of runs where they differ.
 
     What only the folder knows comes last; it is of the machine that published the record.
     """
-    facts = []
+    rows = []
     for column, name in _NAMES.items():
         counts = record.counts(column)
         values = [
             f"{value or 'not known'}" + (f" ({n} runs)" if len(counts) > 1 else "")
             for value, n in counts.items()
         ]
-        facts.append((name[0].upper() + name[1:], "; ".join(values)))
-    there = {name.lower() for name, _ in facts}
-    facts += [(k[0].upper() + k[1:], v) for k, v in circumstances.machine if k not in there]
-    return facts
+        rows.append((name[0].upper() + name[1:], "; ".join(values)))
+    there = {name.lower() for name, _ in rows}
+    rows += [(k[0].upper() + k[1:], v) for k, v in circumstances.machine if k not in there]
+    return rows
 
 
 def hours(seconds: float) -> str:

@@ -104,7 +104,8 @@ def beyond_the_thesis(families: Families) -> tuple[Finding, ...]:
             _each(families, "anchored", say.all_better),
         ),
         Finding(
-            "A model is better than repeating the last observed value, under honest scoring.",
+            "A model is better than repeating the last observed value, under scoring after the "
+            "first observation.",
             ours,
             {
                 label(model): say.all_better(

@@ -75,7 +75,7 @@ class Contents:
 
     @cached_property
     def ranks(self) -> Mapping[float, FriedmanResult | str]:
-        """Friedman's test under honest scoring, by observed share."""
+        """Friedman's test under scoring after the first observation, by observed fraction."""
         return ranks(self.record, "honest")
 
     @cached_property
@@ -202,7 +202,8 @@ class Contents:
             f"Learning curves of one run per model, {at} of the rows observed; axes are "
             "logarithmic, and the first epochs may lie above them. Hollow markers: the thesis' "
             f"table {thesis.CURVE_TABLES[fraction]}.",
-            f"Validation MSE by epoch at {at}, two panels: published and honest scoring. At the "
+            f"Validation MSE by epoch at {at}, two panels: published scoring, "
+            "and after the first observation. At the "
             f"last epoch: {'; '.join(ends)}.",
             curves_figure(self.record, fraction),
         )
@@ -220,8 +221,9 @@ class Contents:
             f"Test MSE of the repeats, {at} of the rows observed; the axis of the "
             "lower panel is logarithmic. Boxes: quartiles and median; whiskers: to the farthest "
             "run within 1.5 times the box; dots: runs.",
-            f"Box plots of the test MSE at {at}, published and honest scoring. Medians under "
-            f"honest scoring: {', '.join(medians)}.",
+            f"Box plots of the test MSE at {at}, published scoring, and after the "
+            "first observation. Medians under "
+            f"scoring after the first observation: {', '.join(medians)}.",
             boxes_figure(self.record, fraction),
         )
 
@@ -265,8 +267,8 @@ class Contents:
             return ""
         counted = f"{least}" if least == most else f"{least} to {most}"
         return (
-            f" So far a model has {counted} of {self.repeats} repeats at a share: so few tell "
-            "little apart, and a verdict can still change."
+            f" So far a model has {counted} of {self.repeats} repeats at a fraction: so few "
+            "have little power, and a verdict can still change."
         )
 
     @property
@@ -299,7 +301,7 @@ def _needs(numbers: Sequence[str], what: str) -> list[str]:
         return []
     named = ", ".join(numbers)
     verb = "Figure {} needs {} at its" if len(numbers) == 1 else "Figures {} each need {} at their"
-    return [f"{verb.format(named, what)} share of observed rows."]
+    return [f"{verb.format(named, what)} fraction of observed rows."]
 
 
 def _illustrated(shown: Illustrations) -> tuple[list[Picture], tuple[str, ...]]:
@@ -382,8 +384,9 @@ def _ranks_picture(number: str, results: Mapping[float, FriedmanResult]) -> Pict
         )
     return Picture(
         number,
-        "Average ranks of the models over the repeats, honest scoring. A grey bar joins models "
-        "that Nemenyi's test does not tell apart; CD is its critical difference.",
+        "Average ranks of the models over the repeats, scoring after the first observation. A "
+        "grey bar joins models whose ranks do not differ significantly by Nemenyi's test; CD is "
+        "its critical difference.",
         f"Average ranks of the models. {' '.join(said)}",
         ranks_figure({percent(f): result for f, result in results.items()}),
         wide=True,

@@ -15,7 +15,7 @@ from thesis.report import thesis_numbers as thesis
 from thesis.report.findings import Verdict
 from thesis.report.pairing import MODELS, Pair, corrected, too_few
 from thesis.report.records import Record
-from thesis.report.tables import COUNTED, by_share, label, percent
+from thesis.report.tables import COUNTED, by_fraction, label, percent
 from thesis.report.tables_tests import signed
 
 _OURS, _OTHER = "ode_gru_d", "ode_rnn"
@@ -134,7 +134,7 @@ class Choice:
 
     Attributes:
         model: label.
-        fraction: observed share of the rows.
+        fraction: observed fraction of the rows.
         chosen: epochs that the thesis chose.
         epochs: length of the curve; 0 without one.
         ratio: error after the chosen epochs over the final one.
@@ -229,7 +229,7 @@ def choice_table(record: Record, *, number: str) -> Table:
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(shown, tuple(rows)))
     chosen = ", ".join(f"{n} at {percent(f)}" for f, n in thesis.CHOSEN_EPOCHS.items())
-    return by_share(
+    return by_fraction(
         record,
         number,
         "Validation error of experiment 1 after the epochs that the thesis chose, over that at the "
@@ -251,7 +251,7 @@ def speed_table(record: Record, *, number: str) -> Table:
                 cells = [_settled(record, experiment, model, f, scoring) for f in thesis.FRACTIONS]
                 rows.append((label(model), tuple(cells)))
             blocks.append(Block(f"Experiment {experiment}, {shown.lower()}", tuple(rows)))
-    return by_share(
+    return by_fraction(
         record,
         number,
         f"Epochs until the validation MSE stays within {100 * TOLERANCE:g}\N{THIN SPACE}% of the "
@@ -273,8 +273,8 @@ def _diluted(record: Record) -> str:
         if len(runs):
             constant = record.values("row_0_constant", runs) / 100
             constant = constant * record.values("hidden_rows_0_share", runs)
-            share = float((constant / record.values("published_mse", runs)).mean())
-            said.append(f"{100 * share:.0f}\N{THIN SPACE}% at {percent(fraction)}")
+            part = float((constant / record.values("published_mse", runs)).mean())
+            said.append(f"{100 * part:.0f}\N{THIN SPACE}% at {percent(fraction)}")
     if not said:
         return ""
     return (

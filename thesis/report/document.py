@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from thesis.report import page
 from thesis.report import thesis_numbers as thesis
-from thesis.report.circumstances import machine_facts, time_facts
+from thesis.report.circumstances import machine_rows, time_rows
 from thesis.report.contents import Contents
 from thesis.report.tables_beyond import constant_residual
 
@@ -20,15 +20,16 @@ _SCORINGS = (
     (
         "Published",
         "All rows of a window; the prediction of row 0 is the observed row 0, or zero "
-        "where it is hidden. It is what the thesis reports; that it scores so is inferred from its "
+        "where it is masked. It is what the thesis reports; that it scores so is inferred from its "
         "numbers.",
     ),
     (
-        "Honest",
-        "The rows after the first observed row of their trajectory, observed or hidden. "
-        "Before it nothing has been seen, and the best prediction of any model is the mean.",
+        "After the first observation",
+        "The rows after the first observed row of their trajectory, observed or masked. "
+        "Before it nothing has been seen, and the best prediction of any model is the mean. "
+        "Columns of the record call it honest.",
     ),
-    ("Honest, hidden rows only", "Of these the rows that the model was not shown."),
+    ("Masked rows only", "Of these the rows that the model was not shown."),
     (
         "Last value",
         "A predictor that repeats the last observed row; before the first one, the "
@@ -70,8 +71,8 @@ def _lead(contents: Contents) -> str:
     shown, full = contents.progress
     return (
         f"{shown} of {full} runs. Every table of the Master's thesis beside our numbers under its "
-        "own scoring and under honest scoring, with the predictor that repeats the last observed "
-        "value beside them."
+        "own scoring and under scoring after the first observation, beside the predictor that "
+        "repeats the last observed value."
     )
 
 
@@ -81,14 +82,14 @@ def _findings(contents: Contents) -> tuple[str, str, str]:
         "What holds",
         page.paragraph(
             "Published scoring is what the thesis reports, with the constant that the first row of "
-            "a window adds; honest scoring counts the rows after the first observed one, where a "
-            "model can know something."
+            "a window adds. Scoring after the first observation counts the rows after the first "
+            "observed one."
         ),
         page.paragraph(
             "Each verdict follows from tests of this record; unfold it for the numbers. "
             f"Differences are first minus second, of the test RMSE; significance at "
-            f"{thesis.ALPHA:g}. 'Not decided' means that the tests tell nothing apart, which is no "
-            "proof that nothing is there; 'cannot be told yet', that runs are missing."
+            f"{thesis.ALPHA:g}. 'Not decided' means that no test is significant, which does not "
+            "prove equality; 'cannot be decided yet', that runs are missing."
             f"{contents.caution}"
         ),
         *map(page.finding, contents.findings),
@@ -111,13 +112,13 @@ def _repeats(contents: Contents) -> tuple[str, str, str]:
         "Experiment 2: repeats",
         *_tables(contents, "3.6", "A.1"),
         page.paragraph(
-            "The published MSE is 0.99 times the MSE of rows 1 to 99, plus c times the share of "
-            "hidden rows 0 over 100, which no causal model can change. In every run of this record "
-            f"the two agree to a relative error of at most {residual:.0e}."
+            "The published MSE is 0.99 times the MSE of rows 1 to 99, plus c times the "
+            "fraction of masked rows 0 over 100, which no causal model can change. In every "
+            f"run of this record the two agree to a relative error of at most {residual:.0e}."
             if residual > _ROUNDING
-            else "The published MSE is 0.99 times the MSE of rows 1 to 99, plus c times the share "
-            "of hidden rows 0 over 100, which no causal model can change. This holds in every run "
-            "of this record, up to rounding."
+            else "The published MSE is 0.99 times the MSE of rows 1 to 99, plus c times the "
+            "fraction of masked rows 0 over 100, which no causal model can change. This holds "
+            "in every run of this record, up to rounding."
         ),
         _narrow(contents, *thesis.BOX_FIGURES.values()),
         *_tables(contents, "A.2"),
@@ -161,7 +162,7 @@ def _method(contents: Contents) -> tuple[str, str, str]:
         "method",
         "How it was made",
         "<h3>Scorings</h3>",
-        page.step_inputs(_SCORINGS),
+        page.definitions(_SCORINGS),
         "<h3>Commands</h3>",
         ""
         if contents.circumstances.commands
@@ -170,10 +171,10 @@ def _method(contents: Contents) -> tuple[str, str, str]:
         ),
         page.commands((*(contents.circumstances.commands or (_REPRODUCE,)), report)),
         "<h3>Time</h3>",
-        page.step_inputs(time_facts(record, contents.circumstances)),
+        page.definitions(time_rows(record, contents.circumstances)),
         *_tables(contents, "A.14", "A.15"),
         '<h3 id="provenance">Machine and versions</h3>',
-        page.step_inputs(machine_facts(record, contents.circumstances)),
+        page.definitions(machine_rows(record, contents.circumstances)),
     )
 
 

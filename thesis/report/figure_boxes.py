@@ -23,7 +23,7 @@ BEYOND = ("gru_unfed", "gru_d_unfed", "gru_fair", "gru_d_fair", "anchored_ode_gr
 
 
 def boxes_figure(record: Record, fraction: float) -> Figure:
-    """Test MSE of each repeat as box plots, published and honest scoring.
+    """Test MSE of each repeat as box plots, published and after the first observation.
 
     Boxes reach from the first to the third quartile with the median inside, whiskers to the
     farthest run within 1.5 times that range; every run is a dot. A diamond with a bar is the
@@ -31,10 +31,10 @@ def boxes_figure(record: Record, fraction: float) -> Figure:
 
     Args:
         record: its runs of experiment 2.
-        fraction: observed share of the rows.
+        fraction: observed fraction of the rows.
 
     Raises:
-        InputError: the record has no run of experiment 2 at this share.
+        InputError: the record has no run of experiment 2 at this fraction.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -45,7 +45,7 @@ def boxes_figure(record: Record, fraction: float) -> Figure:
         )
     panels = {
         "published": ("Published scoring", thesis.MODELS),
-        "honest": ("Honest scoring", (*thesis.MODELS, *BEYOND, LAST_VALUE)),
+        "honest": ("After the first observation", (*thesis.MODELS, *BEYOND, LAST_VALUE)),
     }
     with rc_context(RC):
         figure = Figure(figsize=(COLUMN_WIDTH, 4.4), layout="constrained")

@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 _CHOSEN = "#595959"
 _CUT = 10
 """Epochs that may lie above a panel, of curves ten times as long."""
-_PANELS = {"published": "Published scoring", "honest": "Honest scoring"}
+_PANELS = {"published": "Published scoring", "honest": "After the first observation"}
 
 
 def curves_figure(record: Record, fraction: float) -> Figure:
-    """Validation MSE by epoch, all models of the thesis, published and honest scoring.
+    """Validation MSE by epoch, all models of the thesis, published and after the first observation.
 
     Hollow markers are the thesis' tables 3.1 to 3.4; a dashed line is the last-value
     predictor, a vertical one the number of epochs that the thesis chose.
 
     Args:
         record: its runs of experiment 1, with their curves.
-        fraction: observed share of the rows.
+        fraction: observed fraction of the rows.
 
     Raises:
-        InputError: the record has no curve of experiment 1 at this share.
+        InputError: the record has no curve of experiment 1 at this fraction.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure

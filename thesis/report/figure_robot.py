@@ -83,7 +83,7 @@ def channels_figure(
 
 
 def _shades(count: int) -> list[tuple[float, ...]]:
-    """Steps of one map that the colour-blind tell apart: trajectories have no names."""
+    """Steps of one map that is safe for the colour-blind: trajectories have no names."""
     from matplotlib import colormaps
 
-    return [tuple(colormaps["viridis"](share)) for share in np.linspace(0.0, 0.9, count)]
+    return [tuple(colormaps["viridis"](x)) for x in np.linspace(0.0, 0.9, count)]

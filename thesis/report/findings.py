@@ -11,14 +11,14 @@ from thesis.report.pairing import Pair, Rule
 from thesis.report.tables import label, percent
 from thesis.report.tables_tests import SCORING_NAMES, signed
 
-SCORINGS = {"published": "Published scoring", "honest": "Honest scoring"}
+SCORINGS = {"published": "Published scoring", "honest": "Scoring after the first observation"}
 """Under which conclusions are judged."""
 
 HOLDS = "holds"
 PARTLY = "holds in part"
 FAILS = "does not hold"
 UNDECIDED = "not decided"
-MISSING = "cannot be told yet"
+MISSING = "cannot be decided yet"
 NOT_CONTRADICTED = "not contradicted"
 
 
@@ -57,7 +57,7 @@ def sentence(pair: Pair) -> str:
     a, b, at = label(pair.a), label(pair.b), percent(pair.fraction)
     scoring = SCORING_NAMES[pair.scoring]
     if pair.tied:
-        return f"At {at}, {a} and {b} are not told apart under {scoring}: {pair.missing}."
+        return f"At {at}, {a} and {b} do not differ significantly under {scoring}: {pair.missing}."
     if pair.result is None or pair.t_holm is None:
         return f"At {at}, {a} and {b} cannot be compared under {scoring}: {pair.missing}."
     result, rmse = pair.result, pair.measure == "RMSE"
@@ -68,8 +68,8 @@ def sentence(pair: Pair) -> str:
     )
     less = result.difference.value < 0
     if not pair.significant:
-        what = "" if rmse else " by the epochs that they need"
-        text = f"At {at}, {a} and {b} are not told apart{what} under {scoring}: {numbers}."
+        what = "" if rmse else " in the epochs that they need"
+        text = f"At {at}, {a} and {b} do not differ significantly{what} under {scoring}: {numbers}."
     elif rmse:
         relation = "lower" if less else "higher"
         text = f"At {at}, {a} has a {relation} RMSE than {b} under {scoring}: {numbers}."
@@ -106,7 +106,7 @@ def all_better(pairs: Sequence[Pair]) -> Verdict:
     worse = sum(p.worse for p in tested)
     count = (
         f"Of {len(pairs)} paired tests, {better} find the first model better, {worse} find it "
-        f"worse, {len(tested) - better - worse} do not tell the two apart"
+        f"worse, {len(tested) - better - worse} show no significant difference"
         + (f", {len(pairs) - len(tested)} cannot be made yet." if len(tested) < len(pairs) else ".")
     )
     return judged(len(pairs), len(tested), better, worse, (count, *map(sentence, pairs)))
@@ -151,8 +151,8 @@ def directions(pairs: Sequence[Pair], expected: Mapping[float, int]) -> Verdict:
     """The sign of each difference is the expected one, by the paired tests.
 
     Args:
-        pairs: at the observed shares of `expected`.
-        expected: by observed share, -1 where the first model is to be better, else 1.
+        pairs: at the observed fractions of `expected`.
+        expected: by observed fraction, -1 where the first model is to be better, else 1.
     """
     chosen = [p for p in pairs if p.fraction in expected]
     tested = [p for p in chosen if p.result is not None]
@@ -162,7 +162,7 @@ def directions(pairs: Sequence[Pair], expected: Mapping[float, int]) -> Verdict:
 
 
 def significance(pairs: Sequence[Pair], better_at: Sequence[float]) -> Verdict:
-    """The first model is significantly better at exactly these shares, by the paired tests."""
+    """The first model is significantly better at exactly these fractions, by the paired tests."""
     tested = [p for p in pairs if p.result is not None]
     outcomes = [(p.fraction in better_at, p.better, p.worse) for p in tested]
     right, wrong = _exactly(outcomes)
@@ -191,7 +191,7 @@ def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verd
 
     Args:
         rules: of `pairing.thesis_rule`, ODE-RNN first.
-        better_at: observed shares at which ODE-GRU-D is to be significantly better.
+        better_at: observed fractions at which ODE-GRU-D is to be significantly better.
     """
     said, outcomes = [], []
     names = {"two_sample_t": "the two-sample t test", "welch_t": "Welch's t test"}
@@ -205,7 +205,7 @@ def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verd
         worse = result.significant and not better
         outcomes.append((rule.fraction in better_at, better, worse))
         outcome = (
-            "does not tell the means apart"
+            "finds no significant difference of the means"
             if not result.significant
             else f"finds {label('ode_gru_d' if result.t > 0 else 'ode_rnn')} better"
         )
@@ -219,9 +219,9 @@ def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verd
 
 
 def no_difference(pairs: Sequence[Pair]) -> Verdict:
-    """The two models of each pair are not told apart. Not being told apart proves no equality."""
+    """The two models of each pair do not differ significantly, which proves no equality."""
     tested = [p for p in pairs if p.result is not None]
-    told = sum(p.significant for p in tested)
+    significant = sum(p.significant for p in tested)
     if len(tested) < len(pairs):
         return Verdict(MISSING, tuple(map(sentence, pairs)))
-    return Verdict(FAILS if told else NOT_CONTRADICTED, tuple(map(sentence, pairs)))
+    return Verdict(FAILS if significant else NOT_CONTRADICTED, tuple(map(sentence, pairs)))

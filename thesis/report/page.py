@@ -188,7 +188,7 @@ def finding(one: Finding) -> str:
     )
 
 
-def step_inputs(pairs: Iterable[tuple[str, str]]) -> str:
+def definitions(pairs: Iterable[tuple[str, str]]) -> str:
     """A list of names and values."""
     return "<dl>" + "".join(f"<dt>{text(k)}</dt><dd>{text(v)}</dd>" for k, v in pairs) + "</dl>"
 

@@ -48,17 +48,17 @@ FAMILIES: dict[str, tuple[tuple[str, str], ...]] = {
     "anchored": tuple((ANCHORED, b) for b in (*ODE, *CONTROLS, *FAIR)),
     "last_value": tuple((m, LAST_VALUE) for m in MODELS),
 }
-"""Pairs that are corrected together, over all observed shares of a scoring."""
+"""Pairs that are corrected together, over all observed fractions of a scoring."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two models at one observed share, in the repeats that both have.
+    """Two models at one observed fraction, in the repeats that both have.
 
     Attributes:
         a: label of the first model; a difference is the first minus the second.
         b: label of the second.
-        fraction: observed share of the rows.
+        fraction: observed fraction of the rows.
         scoring: of the RMSE.
         result: every number, or None where there is too little to compare.
         t_holm: p of the paired t test, corrected for the family.
@@ -91,7 +91,7 @@ class Pair:
 
     @property
     def significant(self) -> bool:
-        """The corrected paired t test tells the two apart."""
+        """The corrected paired t test is significant."""
         return self.t_holm is not None and self.t_holm <= thesis.ALPHA
 
     @property
@@ -101,7 +101,7 @@ class Pair:
 
 
 def family(record: Record, name: str, scoring: str) -> tuple[Pair, ...]:
-    """Paired comparisons of a family at every observed share, corrected together by Holm.
+    """Paired comparisons of a family at every observed fraction, corrected together by Holm.
 
     Args:
         record: its runs of experiment 2.
@@ -165,7 +165,7 @@ def paired_rmse(
 
 @dataclass(frozen=True)
 class Rule:
-    """The thesis' rule at one observed share; `result` is None where there is too little."""
+    """The thesis' rule at one observed fraction; `result` is None where there is too little."""
 
     fraction: float
     scoring: str
@@ -176,7 +176,7 @@ class Rule:
 def thesis_rule(
     record: Record, scoring: str, *, a: str = "ode_rnn", b: str = "ode_gru_d"
 ) -> tuple[Rule, ...]:
-    """Applies section 3.4 of the thesis at every observed share.
+    """Applies section 3.4 of the thesis at every observed fraction.
 
     Args:
         record: its runs of experiment 2.
@@ -201,15 +201,15 @@ def thesis_rule(
 def ranks(
     record: Record, scoring: str, *, models: Sequence[str] = RANKED
 ) -> dict[float, FriedmanResult | str]:
-    """Friedman's test over the repeats at each observed share; a reason where there is none.
+    """Friedman's test over the repeats at each observed fraction; a reason where there is none.
 
-    Repeats at one share are draws of their own, and so independent blocks. Shares are not pooled:
-    a repeat's draw may serve several of them.
+    Repeats at one fraction are draws of their own, and so independent blocks. Fractions are not
+    pooled: a repeat's draw may serve several of them.
 
     Args:
         record: its runs of experiment 2.
         scoring: of the RMSE.
-        models: to rank; those without a run at a share are left out there.
+        models: to rank; those without a run at a fraction are left out there.
     """
     found: dict[float, FriedmanResult | str] = {}
     for fraction in thesis.FRACTIONS:

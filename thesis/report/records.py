@@ -18,7 +18,7 @@ PROVENANCE = ("commit", *GROUP)
 """What the runs of one record should share; where they do not, the page says so."""
 
 _MAY_BE_NAN = ("honest_hidden_mse", "last_value_honest_hidden_mse", "validation_published_mse")
-"""A run without hidden rows, or without a validation part, has none."""
+"""A run without masked rows, or without a validation part, has none."""
 
 Columns = Mapping[str, NDArray[Any]]
 
@@ -107,7 +107,7 @@ class Record:
         Args:
             experiment: 1 or 2.
             model: label of the model.
-            fraction: observed share of the rows.
+            fraction: observed fraction of the rows.
         """
         chosen = np.ones(len(self), dtype=bool)
         for column, wanted in (

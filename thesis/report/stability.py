@@ -13,21 +13,21 @@ from thesis.report import thesis_numbers as thesis
 from thesis.report.findings import Verdict
 from thesis.report.pairing import MODELS, paired_rmse, too_few
 from thesis.report.records import Record
-from thesis.report.tables import COUNTED, HEADINGS, by_share, label, percent, rmse_of
+from thesis.report.tables import COUNTED, HEADINGS, by_fraction, label, percent, rmse_of
 
 _OURS = "ode_gru_d"
 
 
 @dataclass(frozen=True)
 class Spread:
-    """The spread of ODE-GRU-D beside that of another model at one observed share.
+    """The spread of ODE-GRU-D beside that of another model at one observed fraction.
 
     Attributes:
         model: the other one.
-        fraction: observed share of the rows.
+        fraction: observed fraction of the rows.
         scoring: of the RMSE.
         result: a ratio below 1 says that ODE-GRU-D is steadier; None where it cannot be tested.
-        p: of Pitman and Morgan's test, corrected by Holm over the observed shares and the models
+        p: of Pitman and Morgan's test, corrected by Holm over the observed fractions and the models
             of the thesis, or those that it does not have.
         missing: why there is no result.
     """
@@ -90,18 +90,18 @@ def spread_verdicts(found: Mapping[str, tuple[Spread, ...]]) -> dict[str, Verdic
     for scoring, shown in say.SCORINGS.items():
         mine = [one for one in found[scoring] if one.model in thesis.MODELS]
         tested = [one for one in mine if one.result is not None and one.p is not None]
-        told = [one for one in tested if (one.p or 0.0) <= thesis.ALPHA]
-        right = sum(one.result.ratio.value < 1 for one in told if one.result)
+        significant = [one for one in tested if (one.p or 0.0) <= thesis.ALPHA]
+        right = sum(one.result.ratio.value < 1 for one in significant if one.result)
         lower = sum(one.result.ratio.value < 1 for one in tested if one.result)
         count = (
             f"{label(_OURS)} spreads less in {lower} of {len(mine)} comparisons; in {right} of "
-            f"them the test tells so, and in {len(told) - right} it tells the opposite."
+            f"them significantly; in {len(significant) - right} it spreads significantly more."
         )
         verdicts[shown] = say.judged(
             len(mine),
             len(tested),
             right,
-            len(told) - right,
+            len(significant) - right,
             (count, *map(_spread_sentence, mine)),
             "comparisons",
         )
@@ -150,13 +150,13 @@ def spread_table(record: Record, found: Mapping[str, tuple[Spread, ...]], *, num
                 cells.append(Cell(text, spread, n=len(values), bold=bold, mark=mark))
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(HEADINGS[scoring], tuple(rows)))
-    return by_share(
+    return by_fraction(
         record,
         number,
         "Standard deviation of the test RMSE over the repeats; in brackets that of "
         f"{label(_OURS)} over it, in the repeats that both have.",
         blocks,
-        f"Below 1: {label(_OURS)} is steadier. Bold: Pitman and Morgan's test for pairs tells "
-        f"the two apart (p ≤ {thesis.ALPHA:g} after Holm).",
+        f"Below 1: {label(_OURS)} is steadier. Bold: significant by Pitman and Morgan's test "
+        f"for pairs (p ≤ {thesis.ALPHA:g} after Holm).",
         COUNTED,
     )

@@ -11,11 +11,11 @@ from offbeat.comparison.table import DASH, Table
 from thesis.protocol import CONTROLS
 from thesis.report import findings as say
 from thesis.report import thesis_numbers as thesis
-from thesis.report.circumstances import machine_facts, time_facts
+from thesis.report.circumstances import machine_rows, time_rows
 from thesis.report.contents import Contents
 from thesis.report.pairing import FAIR, FAMILIES, MODELS, ODE, PLAIN, Pair
 from thesis.report.records import Record
-from thesis.report.tables import SHARES, label, rmse_of
+from thesis.report.tables import PERCENTS, label, rmse_of
 from thesis.report.tables_beyond import constant_of
 from thesis.report.tables_tests import p_cell, signed
 
@@ -29,7 +29,7 @@ _OURS = "ode_gru_d"
 _INFERRED = (
     "That the thesis' scores contain the observed row 0, zero where it is hidden (the constant c): "
     "its code and data are not public. The evidence is that its numbers come out, and that they "
-    "grow nearly linearly with the hidden share.",
+    "grow nearly linearly with the masked fraction.",
     "That its GRU and GRU-D were fed their own predictions at half of the rows "
     "(`self_feeding=0.5`): a public code base of that time does so with plain recurrent models "
     "and not with ODE models; how near the thesis' rows come out with it is table A.1, and that "
@@ -78,15 +78,16 @@ def _top(contents: Contents) -> str:
     return (
         f"{' '.join(lines)}\n\n{faults}"
         f"Made by `{DOCUMENT}` from the results that `report.html` shows, and not edited. Test "
-        "errors in the thesis' scaled units. *Published* scoring is the thesis' own, *honest* "
-        "counts the rows after the first observed one of their trajectory. Paired tests compare "
-        "models within a repeat, where they share windows, hidden rows and split; p is corrected "
+        "errors in the thesis' scaled units. *Published scoring* is the thesis' own; *scoring "
+        "after the first observation* counts the rows after the first observed one of their "
+        "trajectory, and columns of the record call it `honest`. Paired tests compare "
+        "models within a repeat, where they share windows, masks and split; p is corrected "
         f"by Holm within a family of comparisons, and {thesis.ALPHA:g} is the level."
     )
 
 
 def _missing(contents: Contents) -> str:
-    """Runs that are not there, named by experiment, model and share."""
+    """Runs that are not there, named by experiment, model and fraction."""
     record, said = contents.record, []
     for experiment, models, asked in ((1, thesis.MODELS, 1), (2, MODELS, contents.repeats)):
         lacking = dict[str, str]()
@@ -99,8 +100,7 @@ def _missing(contents: Contents) -> str:
                 lacking[label(model)] = ", ".join(map(str, there)) if any(there) else "none"
         if lacking:
             said.append(f"Experiment {experiment}, of {asked} each: {_grouped(lacking)}.")
-    shares = ", ".join(SHARES)
-    return f"Runs that are there, at {shares}. {' '.join(said)}" if said else ""
+    return f"Runs that are there, at {', '.join(PERCENTS)}. {' '.join(said)}" if said else ""
 
 
 def _conclusions(contents: Contents) -> Iterable[str]:
@@ -118,13 +118,13 @@ def _conclusions(contents: Contents) -> Iterable[str]:
                     mine.append(f"{name.removeprefix(shown).strip(', ')}: {words}")
         if any(scored.values()):
             rows.append((finding.claim, finding.source, *map("; ".join, scored.values())))
-        else:  # judged per model, under honest scoring
+        else:  # judged per model, under scoring after the first observation
             rows.append((finding.claim, finding.source, DASH, _grouped(by)))
     yield _grid(("Claim", "Source", *say.SCORINGS.values()), rows)
     yield (
         "Verdicts follow from paired tests; 'the thesis' rule' is its own choice of tests, which "
-        "takes the runs to be independent. 'Not decided': the tests tell nothing apart, which is "
-        f"no proof that nothing is there.{contents.caution}"
+        "takes the runs to be independent. 'Not decided': no test is significant, which "
+        f"does not prove equality.{contents.caution}"
     )
     yield _source("the section 'What holds' of `report.html`, with every difference and p")
 
@@ -139,28 +139,28 @@ def _distances(contents: Contents) -> Iterable[str]:
 def _constant(contents: Contents) -> Iterable[str]:
     yield "## What the constant of the first row does"
     record = contents.record
-    alone, share, inferred = list[str](), list[str](), list[str]()
+    alone, part, inferred = list[str](), list[str](), list[str]()
     ours, spread, printed = list[str](), list[str](), list[str]()
     for i, fraction in enumerate(thesis.FRACTIONS):
         mean, std = thesis.TEST_RMSE[_OURS][i]
         printed.append(f"{std:.4f}")
         c, _, parts = constant_of(record, fraction)
         inferred.append(
-            _share(float(c.mean()) * (1 - fraction) / 100 / mean**2) if len(c) else DASH
+            _percent(float(c.mean()) * (1 - fraction) / 100 / mean**2) if len(c) else DASH
         )
         alone.append(f"{np.sqrt(parts.mean()):.4f}" if len(parts) else DASH)
         runs, rmse = rmse_of(record, _OURS, fraction, "published")
-        share.append(_share(float(np.mean(_own(record, runs) / rmse**2))) if len(runs) else DASH)
+        part.append(_percent(float(np.mean(_own(record, runs) / rmse**2))) if len(runs) else DASH)
         ours.append(f"{rmse.std(ddof=1):.4f}" if len(runs) > 1 else DASH)
         alone_spread = _spread_of_constant(record, fraction)
         spread.append(DASH if alone_spread is None else f"{alone_spread:.4f}")
     name = label(_OURS)
     yield _grid(
-        ("", *SHARES),
+        ("", *PERCENTS),
         [
             ("Published RMSE of a model without any other error", *alone),
-            (f"Its share of the published MSE of {name}, ours", *share),
-            (f"Its share of the squared RMSE of {name} in the thesis (inferred)", *inferred),
+            (f"Its fraction of the published MSE of {name}, ours", *part),
+            (f"Its fraction of the squared RMSE of {name} in the thesis (inferred)", *inferred),
             (f"Standard deviation over repeats of the RMSE of {name}, ours", *ours),
             ("The same, if nothing but the constant varied", *spread),
             (f"Standard deviation of {name} in the thesis", *printed),
@@ -168,8 +168,8 @@ def _constant(contents: Contents) -> Iterable[str]:
     )
     yield (
         "No causal model can change this part: row 0 is scored before anything can be known of it. "
-        "It is the same for all models of a repeat: it falls out of paired differences of the MSE, "
-        "and it makes ratios of errors come nearer to 1."
+        "It is the same for all models of a repeat: it cancels in paired differences of the MSE, "
+        "and it moves ratios of errors towards 1."
     )
     yield _source("`record.csv`: `row_0_constant`, `hidden_rows_0_share`, `published_mse`")
 
@@ -191,12 +191,12 @@ def _spread_of_constant(record: Record, fraction: float) -> float | None:
 
 
 def _against_the_constant(record: Record) -> str:
-    """Whether the spread of the thesis' repeats leaves room for the constant, share by share."""
+    """Whether the spread of the thesis' repeats leaves room for the constant, at each fraction."""
     more, less = list[str](), list[str]()
     for i, fraction in enumerate(thesis.FRACTIONS):
         spread = _spread_of_constant(record, fraction)
         if spread is not None:
-            (more if spread > thesis.TEST_RMSE[_OURS][i][1] else less).append(SHARES[i])
+            (more if spread > thesis.TEST_RMSE[_OURS][i][1] else less).append(PERCENTS[i])
     name = label(_OURS)
     said = (
         "Against it: the constant alone makes our repeats spread more than the thesis prints for "
@@ -227,11 +227,11 @@ def _self_feeding(contents: Contents) -> Iterable[str]:
                 rows.append(
                     (f"{label(ode)} minus {label(rival)}, of that minus {label(simple)}", *cells)
                 )
-        yield _grid((f"RMSE, {shown.lower()}", *SHARES), rows)
+        yield _grid((f"RMSE, {shown.lower()}", *PERCENTS), rows)
     yield (
         "The rows of the ODE models: the mean difference from the other model, and in brackets how "
         "much it is of the difference from the thesis' row; below zero, the other model has the "
-        "lower error. Bold: told apart by the paired t test after Holm. The models that are not "
+        "lower error. Bold: significant by the paired t test after Holm. The models that are not "
         "self-fed are the thesis' rows without self-feeding, and nothing else is changed: their "
         "rows show what it does by itself. The fair models also update at every row, and GRU is "
         "given the age of each channel."
@@ -240,23 +240,23 @@ def _self_feeding(contents: Contents) -> Iterable[str]:
 
 
 def _differences(contents: Contents) -> Iterable[str]:
-    yield "## Which differences are real"
+    yield "## Which differences are significant"
     rows = []
     for name, keys in FAMILIES.items():
         pairs = _by_key(contents, name, "honest")
         for a, b in keys:
             cells = [_difference(pairs[a, b, f]) for f in thesis.FRACTIONS]
             rows.append((f"{label(a)} minus {label(b)}", *cells))
-    yield _grid(("RMSE, honest scoring", *SHARES), rows)
+    yield _grid(("RMSE, scoring after the first observation", *PERCENTS), rows)
     tested = [p for name in FAMILIES for p in contents.families[name, "honest"] if p.result]
     asked = sum(len(contents.families[name, "honest"]) for name in FAMILIES)
     if len(tested) < asked:
         yield f"{len(tested)} of {asked} comparisons can be made yet; the others lack runs."
     if tested:
-        told = sum(p.significant for p in tested)
+        significant = sum(p.significant for p in tested)
         yield (
-            f"Of {len(tested)} comparisons, {told} are told apart (bold): these are real at this "
-            f"level, on this robot and protocol. The other {len(tested) - told} are not decided."
+            f"Of {len(tested)} comparisons, {significant} are significant (bold), on this robot "
+            f"and protocol. The other {len(tested) - significant} are not decided."
         )
     yield (
         "The anchored model has another size, optimizer and rate than the models of the thesis, "
@@ -301,11 +301,11 @@ def _stability(contents: Contents) -> Iterable[str]:
                 ends = "" if ratio.low is None else f" [{ratio.low:.2f}, {ratio.high:.2f}]"
                 cells.append(_bold(f"{ratio.value:.2f}{ends} ({_p(one.p)})", one.p <= thesis.ALPHA))
             rows.append((label(model), *cells))
-        yield _grid((f"{shown}, against", *SHARES), rows)
+        yield _grid((f"{shown}, against", *PERCENTS), rows)
     yield (
         f"Standard deviation of the test RMSE of {label(_OURS)} over that of the other model; "
         "below 1 it is the steadier. In brackets p of Pitman and Morgan's test for pairs after "
-        "Holm; bold where it tells the two apart. Intervals are bootstrap and, from ten runs, too "
+        "Holm; bold where it is significant. Intervals are bootstrap and, from ten runs, too "
         "short."
     )
     yield _source("`tables/table-a-11.csv`")
@@ -327,7 +327,7 @@ def _made(contents: Contents) -> Iterable[str]:
     )
     yield _grid(
         ("", ""),
-        [*time_facts(record, circumstances), *machine_facts(record, circumstances)],
+        [*time_rows(record, circumstances), *machine_rows(record, circumstances)],
     )
 
 
@@ -339,7 +339,7 @@ def _verdict(verdict: say.Verdict) -> str:
 
 
 def _grouped(words: Mapping[str, str]) -> str:
-    """Names that share what is said of them, said once."""
+    """Names with the same text, joined."""
     names = dict[str, list[str]]()
     for name, said in words.items():
         names.setdefault(said, []).append(name)
@@ -362,11 +362,11 @@ def _left(plain: Pair, fair: Pair) -> str:
     if plain.result is None or fair.result is None:
         return DASH
     value = fair.result.difference.value
-    part = _share(value / plain.result.difference.value) if plain.better else DASH
+    part = _percent(value / plain.result.difference.value) if plain.better else DASH
     return _bold(f"{signed(value)} ({part})", fair.significant)
 
 
-def _share(value: float) -> str:
+def _percent(value: float) -> str:
     return f"{100 * value:.0f}\N{THIN SPACE}%".replace("-", "\N{MINUS SIGN}")
 
 

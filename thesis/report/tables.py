@@ -15,7 +15,7 @@ from thesis.report.records import Record
 HEADINGS = {
     "thesis": "Thesis",
     "published": "Ours, published scoring",
-    "honest": "Ours, honest scoring",
+    "honest": "Ours, scoring after the first observation",
 }
 LAST_VALUE = "last_value"
 
@@ -35,12 +35,12 @@ _RMSE_DIGITS = {"published": 4, "honest": 5, "honest_hidden": 5}
 
 
 def percent(fraction: float) -> str:
-    """An observed share as tables name it."""
+    """An observed fraction as tables name it."""
     return f"{100 * fraction:g}\N{THIN SPACE}%"
 
 
-SHARES = tuple(map(percent, thesis.FRACTIONS))
-"""Columns of tables with one per observed share."""
+PERCENTS = tuple(map(percent, thesis.FRACTIONS))
+"""Columns of tables with one per observed fraction."""
 
 COUNTED = "Table A.14 counts the runs behind a cell."
 
@@ -87,7 +87,7 @@ def notes(record: Record, tables: Sequence[Block], *others: str) -> tuple[str, .
     return (*filter(None, others), *([_MIXED_NOTE] if marked else []))
 
 
-def by_share(
+def by_fraction(
     record: Record,
     number: str,
     caption: str,
@@ -95,24 +95,24 @@ def by_share(
     *said: str,
     head: str = "Model",
 ) -> Table:
-    """A table with a column per observed share; of its notes those that are not empty.
+    """A table with a column per observed fraction; of its notes those that are not empty.
 
     Args:
         record: what the numbers are of.
         number: of the table.
         caption: a sentence, without the number.
-        blocks: rows with a cell per share, in the order of `SHARES`.
+        blocks: rows with a cell per fraction, in the order of `PERCENTS`.
         said: notes, after which come those that every table has.
         head: of the first column.
     """
-    return Table(number, caption, head, SHARES, tuple(blocks), notes(record, blocks, *said))
+    return Table(number, caption, head, PERCENTS, tuple(blocks), notes(record, blocks, *said))
 
 
 # --- tables 3.1 to 3.4 ----------------------------------------------------------------------------
 
 
 def curve_table(record: Record, fraction: float) -> Table:
-    """Validation MSE every 50 epochs at one observed share: tables 3.1 to 3.4.
+    """Validation MSE every 50 epochs at one observed fraction: tables 3.1 to 3.4.
 
     Args:
         record: its runs of experiment 1.
@@ -219,10 +219,10 @@ def final_table(record: Record) -> Table:
             cells.append(mean_cell(record, values, runs, digits=digits))
         rows.append((label(LAST_VALUE), cells))
         blocks.append(Block(HEADINGS[scoring], bold_lowest(rows)))
-    return by_share(
+    return by_fraction(
         record,
         "3.5",
-        f"Test MSE after {_epochs_of(record)} epochs, by the share of observed rows.",
+        f"Test MSE after {_epochs_of(record)} epochs, by the fraction of observed rows.",
         blocks,
         _BOLD_NOTE,
         _SELF_FEEDING,
@@ -250,10 +250,10 @@ def repeats_table(record: Record, *, repeats: int = thesis.REPEATS) -> Table:
     for scoring in ("published", "honest"):
         rows = rmse_rows(record, thesis.MODELS, scoring, repeats=repeats)
         blocks.append(Block(HEADINGS[scoring], bold_lowest(rows)))
-    return by_share(
+    return by_fraction(
         record,
         "3.6",
-        "Test RMSE over the repeats, mean ± standard deviation, by the share of observed rows.",
+        "Test RMSE over the repeats, mean ± standard deviation, by the fraction of observed rows.",
         blocks,
         _BOLD_NOTE,
         _SELF_FEEDING,

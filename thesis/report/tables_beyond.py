@@ -11,8 +11,8 @@ from thesis.report.pairing import MODELS
 from thesis.report.records import Record
 from thesis.report.tables import (
     HEADINGS,
-    SHARES,
-    by_share,
+    PERCENTS,
+    by_fraction,
     label,
     missing_runs,
     rmse_of,
@@ -26,12 +26,12 @@ _WITHIN = 2.0
 
 def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
     """Test RMSE of every model of experiment 2 and of the last value, under three scorings."""
-    headings = {**HEADINGS, "honest_hidden": "Ours, honest scoring, hidden rows only"}
+    headings = {**HEADINGS, "honest_hidden": "Ours, masked rows only"}
     blocks = [
         Block(headings[scoring], bold_lowest(rmse_rows(record, MODELS, scoring, repeats=repeats)))
         for scoring in ("published", "honest", "honest_hidden")
     ]
-    return by_share(
+    return by_fraction(
         record,
         number,
         "Test RMSE of all models over the repeats, mean ± standard deviation.",
@@ -68,10 +68,10 @@ def distance_table(record: Record, *, number: str) -> Table:
     ours = [constant_of(record, fraction) for fraction in thesis.FRACTIONS]
     facts = {
         "Mean square of row 0, c": [c[0] for c in ours],
-        "Share of hidden rows 0": [c[1] for c in ours],
-        f"Part of the published MSE, c {TIMES} share / 100": [c[2] for c in ours],
+        "Fraction of masked rows 0": [c[1] for c in ours],
+        f"Part of the published MSE, c {TIMES} fraction / 100": [c[2] for c in ours],
     }
-    digits = {"Mean square of row 0, c": 3, "Share of hidden rows 0": 3}
+    digits = {"Mean square of row 0, c": 3, "Fraction of masked rows 0": 3}
     blocks = (
         Block(f"(ours {MINUS} thesis) / standard deviation of the thesis", tuple(rows)),
         Block(
@@ -91,7 +91,7 @@ def distance_table(record: Record, *, number: str) -> Table:
         ),
         Block("c at which our mean would be the thesis' (inferred)", tuple(needed)),
     )
-    return by_share(
+    return by_fraction(
         record,
         number,
         "Distance of our test RMSE from table 3.6, published scoring.",
@@ -103,7 +103,7 @@ def distance_table(record: Record, *, number: str) -> Table:
 
 
 def _constants_needed(record: Record, model: str) -> tuple[Cell, ...]:
-    """The c of which `0.99 rows_1_99 + c share / 100` would have the thesis' mean RMSE.
+    """The c of which `0.99 rows_1_99 + c fraction / 100` would have the thesis' mean RMSE.
 
     A dash where there is none: the rest alone is above it, or no row 0 is hidden in some run.
     """
@@ -131,7 +131,7 @@ def _above(c: float, rest: Values, share: Values, mean: float) -> float:
 def constant_of(
     record: Record, fraction: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Per repeat: c, the share of hidden rows 0, and what they add to the published MSE.
+    """Per repeat: c, the fraction of masked rows 0, and what they add to the published MSE.
 
     The last is `published - (1 - 1/rows) rows_1_99`, with the number of rows of the protocol, 100.
     """
@@ -144,7 +144,7 @@ def constant_of(
 
 
 def constant_residual(record: Record) -> float:
-    """Largest relative error of `published = 0.99 rows_1_99 + c share / 100` over all runs."""
+    """Largest relative error of `published = 0.99 rows_1_99 + c fraction / 100` over all runs."""
     runs = record.runs
     published = runs["published_mse"].astype(float)
     said = 0.99 * runs["rows_1_99_mse"] + runs["row_0_constant"] * runs["hidden_rows_0_share"] / 100
@@ -167,7 +167,7 @@ def runs_table(record: Record, *, repeats: int, number: str) -> Table:
                 cells.append(Cell(f"{there} of {asked}", float(there), n=there, bold=not whole))
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(f"Experiment {experiment}", tuple(rows)))
-    return by_share(
+    return by_fraction(
         record,
         number,
         "Runs that are there, of those of the full protocol.",
@@ -204,10 +204,10 @@ def cost_table(record: Record, *, number: str) -> Table:
             blocks.append(Block(name, tuple(rows)))
     return Table(
         number,
-        "Run time in minutes, summed over the runs of a cell; its share of all, and per step of "
+        "Run time in minutes, summed over the runs of a cell; its part of all, and per step of "
         "the optimizer.",
         "Model",
-        (*SHARES, "Sum (min)", "Share (%)", "Per step (ms)"),
+        (*PERCENTS, "Sum (min)", "Share (%)", "Per step (ms)"),
         tuple(blocks),
         ("A run's time is its wall time, with as many threads as the record says.",),
     )

@@ -14,8 +14,8 @@ from thesis.report.records import Record
 from thesis.report.tables import (
     HEADINGS,
     LAST_VALUE,
-    SHARES,
-    by_share,
+    PERCENTS,
+    by_fraction,
     label,
     notes,
     percent,
@@ -24,8 +24,8 @@ from thesis.report.tables import (
 
 SCORING_NAMES = {
     "published": "published scoring",
-    "honest": "honest scoring",
-    "honest_hidden": "honest scoring, hidden rows only",
+    "honest": "scoring after the first observation",
+    "honest_hidden": "masked rows only",
 }
 
 _SIGNIFICANT = f"Bold: below the level of significance, {thesis.ALPHA:g}."
@@ -74,7 +74,7 @@ def normality_table(record: Record) -> Table:
                 cells.append(p_cell(outcome.p, n=len(values), mark=mark))
             rows.append((label(model), tuple(cells)))
         blocks.append(Block(HEADINGS[scoring], tuple(rows)))
-    return by_share(
+    return by_fraction(
         record,
         "3.7",
         "Shapiro-Wilk test of the test RMSE over the repeats: p-values.",
@@ -120,7 +120,7 @@ def rule_table(record: Record, rules: Mapping[tuple[str, str], Sequence[Rule]]) 
         heading = f"{HEADINGS[scoring]}: {label(first)} and {label('ode_gru_d')}"
         rows = zip(names.values(), zip(*columns, strict=True), strict=True)
         blocks.append(Block(heading, tuple(rows)))
-    return by_share(
+    return by_fraction(
         record,
         "3.8",
         "The thesis' rule on the test RMSE: p-values of Bartlett's test, then of the two-sample t "
@@ -150,7 +150,7 @@ def paired_table(record: Record, pairs: Sequence[Pair], *, number: str, scoring:
 
     Args:
         record: for the provenance of the runs.
-        pairs: of one pair of models, at every observed share.
+        pairs: of one pair of models, at every observed fraction.
         number: of the table.
         scoring: for the caption.
     """
@@ -197,7 +197,7 @@ def paired_table(record: Record, pairs: Sequence[Pair], *, number: str, scoring:
             record,
             [block],
             f"{_SIGNIFICANT} Negative: {label(pairs[0].a)} is better. p-values are corrected over "
-            "the observed shares.",
+            "the observed fractions.",
             " ".join(missing),
         ),
     )
@@ -227,7 +227,7 @@ def family_table(
             )
         missing += [p.missing for p in pairs if p.missing]
         blocks.append(Block(heading, tuple(rows)))
-    return by_share(
+    return by_fraction(
         record,
         number,
         caption,
@@ -298,7 +298,7 @@ def ranks_table(
         number,
         f"Ranks of the models over the repeats by test RMSE, {SCORING_NAMES[scoring]}.",
         "Model",
-        SHARES,
+        PERCENTS,
         tuple(blocks),
         tuple(
             filter(
@@ -306,7 +306,7 @@ def ranks_table(
                 [
                     "Rank 1 is the lowest error of a repeat. Bold: the best rank, and p-values "
                     f"below {thesis.ALPHA:g}. Ranks that differ by less than the critical "
-                    "difference are not told apart.",
+                    "difference do not differ significantly.",
                     " ".join(reasons),
                 ],
             )

@@ -11,7 +11,7 @@ MODELS = ("gru", "gru_d", "ode_rnn", "ode_gru_d")
 """In the order of the rows of its tables."""
 
 FRACTIONS = (0.9, 0.7, 0.5, 0.3)
-"""Observed shares of the rows, in the order of the columns of tables 3.5 to 3.8."""
+"""Observed fractions of the rows, in the order of the columns of tables 3.5 to 3.8."""
 
 EPOCHS = (50, 100, 150, 200, 250, 300)
 """Columns of tables 3.1 to 3.4."""
@@ -21,7 +21,7 @@ CURVE_FIGURES = {0.9: "3.3", 0.7: "3.4", 0.5: "3.5", 0.3: "3.6"}
 BOX_FIGURES = {0.9: "3.7", 0.7: "3.8", 0.5: "3.9", 0.3: "3.10"}
 
 REPEATS = 10
-"""Of each model and share in experiment 2 (section 3.3)."""
+"""Of each model and fraction in experiment 2 (section 3.3)."""
 
 CHOSEN_EPOCHS = {0.9: 75, 0.7: 50, 0.5: 50, 0.3: 50}
 """The epochs that experiment 1 led to (section 3.2)."""
@@ -55,7 +55,7 @@ VALIDATION_MSE: dict[float, dict[str, tuple[float, ...]]] = {
         "ode_gru_d": (0.01041, 0.01004, 0.00989, 0.00971, 0.00995, 0.01011),
     },
 }
-"""Tables 3.1 to 3.4: validation MSE by observed share and model, at `EPOCHS`."""
+"""Tables 3.1 to 3.4: validation MSE by observed fraction and model, at `EPOCHS`."""
 
 TEST_MSE: dict[str, tuple[float, ...]] = {
     "gru": (0.00165, 0.00465, 0.00781, 0.01198),
@@ -95,7 +95,7 @@ SLIPS: dict[str, str] = {
 """By table: where the thesis disagrees with itself."""
 
 CONCLUSIONS: dict[str, str] = {
-    "1": "ODE-based models are notably better than GRU and GRU-D at every observed share.",
+    "1": "ODE-based models are notably better than GRU and GRU-D at every observed fraction.",
     "2": "ODE-GRU-D converges in fewer epochs than ODE-RNN.",
     "3": "At 90 % ODE-RNN has the lower mean error; at 70, 50 and 30 % ODE-GRU-D has.",
     "4": "ODE-GRU-D is the most stable model: its errors spread least between repeats.",
