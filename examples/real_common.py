@@ -83,7 +83,7 @@ def silenced(log: Log, dataset: ob.Dataset, *, seed: int = 0) -> ob.Dataset:
     return ob.mask_out(
         dataset,
         0.7,
-        hide="dropout",
+        mask="dropout",
         burst_s=log.silence_s,
         sensors=log.sensors,
         seed=seed,
@@ -99,7 +99,7 @@ def views(log: Log, dataset: ob.Dataset, seed: int) -> tuple[ob.Dataset, ob.Data
     return (
         dataset,
         silenced(log, dataset, seed=seed),
-        ob.mask_out(dataset, 0.6, hide="bursts", burst_s=log.horizons_s[-1] / 2, seed=seed),
+        ob.mask_out(dataset, 0.6, mask="bursts", burst_s=log.horizons_s[-1] / 2, seed=seed),
     )
 
 

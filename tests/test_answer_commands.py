@@ -20,7 +20,7 @@ from offbeat.plots.answers import answers
 
 NAMES = ("gyro", "tilt", "height")
 PARTS = [
-    "--split.split=in_time", "--split.window_s=0.4", "--split.hide=bursts",
+    "--split.by=time", "--split.window_s=0.4", "--split.mask=bursts",
     "--split.burst_s=0.05", "--split.observed_fraction=0.7",
 ]  # fmt: skip
 MODEL = ["--model.hidden_size=4", "--model.field_units=[6]", "--training.epochs=1"]
@@ -151,12 +151,12 @@ def test_other_data_is_hidden_in_any_way_and_scored_as_a_whole(run, log, tmp_pat
     other = tmp_path / "other.csv"
     other.write_text("\n".join(log.read_text().splitlines()[:200]) + "\n")
     capsys.readouterr()
-    hiding = ["--observed_fraction=0.6", "--hide=cells"]
+    hiding = ["--observed_fraction=0.6", "--mask=values"]
     assert main(["evaluate", str(run), str(other), *hiding, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["part"] == "all"
     data = ob.read(other, time_column="stamp", time_unit="ms")
-    hidden = ob.mask_out(data, 0.6, hide="cells")[0]
+    hidden = ob.mask_out(data, 0.6, mask="values")[0]
     expected = (data[0].observed & ~hidden.observed).sum(axis=0).tolist()
     assert list(said["imputation"]["cells"].values()) == expected
 
@@ -228,10 +228,10 @@ def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
         (["impute", run, log, out, "--reader.format=cvs"], "did you mean 'csv'"),
         (["forecast", run, log, out], "horizons"),
         (["forecast", run, log, out, "--horizons=0"], "above 0"),
-        (["evaluate", run, log, "--hide=burst"], "did you mean 'bursts'"),
+        (["evaluate", run, log, "--mask=burst"], "did you mean 'bursts'"),
         (["evaluate", run, log, "--horizons=1000"], "use shorter horizons"),
-        (["train", log, out.parent, *READER, "--split.hide=cell"], "hide"),
-        (["train", log, out.parent, *READER], "split='in_time'"),
+        (["train", log, out.parent, *READER, "--split.mask=cell"], "mask"),
+        (["train", log, out.parent, *READER], "by='time'"),
         (["predict", run, log, out, "--reader.delimiter=;;"], "delimiter"),
     ):
         assert message in one_line_error(capsys, *arguments)

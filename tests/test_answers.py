@@ -326,7 +326,7 @@ CONFIG = ob.TrainConfig(epochs=2, batch_size=4, optimizer="adam")
 
 
 def trained(out=None) -> tuple[ob.TwoSided, ob.Dataset]:
-    data = ob.mask_out(dataset(8, rows=15, share=2.0), 0.6, hide="cells", seed=1)
+    data = ob.mask_out(dataset(8, rows=15, share=2.0), 0.6, mask="values", seed=1)
     train, validation = data[:5], data[5:]
     model = ob.make_model("gru_d", train, hidden_size=3, decoder_units=(4,))
     pair, _, _ = ob.fit_two_sided(model, train, validation, CONFIG, out=out, progress=False)

@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.data.store import load
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, FileFormatError

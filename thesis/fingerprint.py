@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.evaluation import evaluate
 from offbeat.models.zoo import make_model

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from offbeat.data.masking import mask_out
 from offbeat.data.simulate import simulate
-from offbeat.data.splits import windows
 from offbeat.data.trajectory import Dataset
+from offbeat.data.windows import windows
 from offbeat.errors import InputError, MissingExtraError, require
 from offbeat.models.checkpoint import CONFIG, load_model
 from offbeat.models.model import Model

@@ -221,7 +221,8 @@ class Protocol:
             run: names fraction and seed.
         """
         from offbeat.data.masking import mask_out
-        from offbeat.data.splits import split, windows
+        from offbeat.data.splits import split
+        from offbeat.data.windows import windows
 
         cut = windows(recorded, self.window, seed=run.seed_draw)
         masked = mask_out(cut, run.observed_fraction, seed=run.seed_draw)

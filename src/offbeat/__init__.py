@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from offbeat.data.batch import Batch, delta, last_values
     from offbeat.data.masking import mask_out
     from offbeat.data.readers import read
+    from offbeat.data.scaler import Scaler
     from offbeat.data.simulate import simulate
-    from offbeat.data.splits import Scaler, apply_split, split, split_in_time, windows
+    from offbeat.data.splits import apply_split, split, split_in_time
     from offbeat.data.store import load, save
     from offbeat.data.trajectory import Dataset, Trajectory
+    from offbeat.data.windows import windows
     from offbeat.evaluation import Evaluation, evaluate
     from offbeat.export.exporter import export_onnx
     from offbeat.export.runner import OnnxStream
@@ -49,7 +51,7 @@ _HOMES = {
     "FitResult": "training",
     "Model": "models.model",
     "OnnxStream": "export.runner",
-    "Scaler": "data.splits",
+    "Scaler": "data.scaler",
     "Score": "metrics",
     "Scores": "metrics",
     "Stream": "stream.stream",
@@ -87,7 +89,7 @@ _HOMES = {
     "split_in_time": "data.splits",
     "thesis_config": "models.zoo",
     "train_config": "models.zoo",
-    "windows": "data.splits",
+    "windows": "data.windows",
 }
 
 __all__ = [

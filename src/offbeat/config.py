@@ -140,14 +140,14 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 }
 
 
-HIDINGS = ("rows", "cells", "bursts", "dropout")
-"""Ways of hiding observed cells; `data.thin` says what each does."""
+MASKS = ("rows", "values", "bursts", "dropout")
+"""Ways of masking observed values; `offbeat.data.masking.mask_out` says what each does."""
 
 CUTS = ("one", "consecutive", "random")
-"""Ways of cutting windows; `data.prepare.windows` says what each does."""
+"""Ways of cutting windows; `offbeat.data.windows.windows` says what each does."""
 
-SPLITS = ("by_trajectory", "in_time")
-"""Ways of sharing out data; `data.prepare.parts` says what each does."""
+SPLITS = ("trajectory", "time")
+"""Ways of splitting; `offbeat.data.splits.apply_split` says what each does."""
 
 
 @dataclass(frozen=True)
@@ -159,21 +159,21 @@ class SplitConfig:
         window_s: length of a window in seconds, instead of in rows.
         cut: `one` window out of each trajectory, its start drawn; `consecutive`, one after the
             other, nothing left out; `random`, drawn for training, consecutive for the other parts.
-            By default `one`, and `consecutive` where the split is in time.
+            By default `one`, and `consecutive` where the split is by time.
         window_count: windows that `random` draws from each trajectory; by default as many as are
             as long as the trajectory together.
-        observed_fraction: share of what was observed that stays observed; None hides nothing.
-        hide: `rows`, all channels together at random; `cells`, each channel on its own; `bursts`,
-            runs of rows; `dropout`, each sensor silent for spans of its own.
-        burst_rows: rows of a burst or of a silence; None, and no burst_s, makes it a single one.
-        burst_s: its length in seconds, instead of in rows.
-        sensors: channels that fall silent together in `dropout`, a list of names per sensor; by
+        observed_fraction: fraction of what was observed that stays observed; None masks nothing.
+        mask: `rows`, all channels together at random; `values`, each channel on its own; `bursts`,
+            runs of consecutive rows; `dropout`, runs of each sensor on its own.
+        burst_rows: rows of a run; None, and no burst_s, makes it a single one.
+        burst_s: length of a run in seconds, instead of in rows.
+        sensors: channels that drop out together in `dropout`, a list of names per sensor; by
             default channels that were always observed together.
-        split: `by_trajectory`, at random; `in_time`, the first rows of the log train, those after
-            them validate, the last ones test, and no window straddles.
-        fractions: shares of training, validation and test, of the trajectories or of the rows; they
-            sum to 1.
-        seed: of windows, hiding and split.
+        by: split by `trajectory`, at random, or by `time`: the first rows train, those after them
+            validate, the last ones test, and no window spans two parts.
+        fractions: of the trajectories, or of the rows, for training, validation and test; they sum
+            to 1.
+        seed: of windows, masks and split.
     """
 
     window: int | None = None
@@ -181,11 +181,11 @@ class SplitConfig:
     cut: Literal["one", "consecutive", "random"] | None = None
     window_count: int | None = None
     observed_fraction: float | None = None
-    hide: Literal["rows", "cells", "bursts", "dropout"] = "rows"
+    mask: Literal["rows", "values", "bursts", "dropout"] = "rows"
     burst_rows: int | None = None
     burst_s: float | None = None
     sensors: tuple[tuple[str, ...], ...] | None = None
-    split: Literal["by_trajectory", "in_time"] = "by_trajectory"
+    by: Literal["trajectory", "time"] = "trajectory"
     fractions: tuple[float, float, float] = (0.7, 0.15, 0.15)
     seed: int = 0
 
@@ -193,8 +193,8 @@ class SplitConfig:
         object.__setattr__(self, "fractions", tuple(self.fractions))
         if self.sensors is not None:
             object.__setattr__(self, "sensors", tuple(tuple(names) for names in self.sensors))
-        one_of("way of hiding", self.hide, HIDINGS)
-        one_of("split", self.split, SPLITS)
+        one_of("mask", self.mask, MASKS)
+        one_of("way of splitting", self.by, SPLITS)
         if self.cut is not None:
             one_of("cut", self.cut, CUTS)
         for name in ("window", "window_count", "burst_rows"):
@@ -211,11 +211,11 @@ class SplitConfig:
         check_seed(self.seed)
 
     @property
-    def hiding(self) -> dict[str, Any]:
+    def masking(self) -> dict[str, Any]:
         """What `mask_out` is given beside the data and the seed."""
         return {
             "observed_fraction": self.observed_fraction,
-            "hide": self.hide,
+            "mask": self.mask,
             "burst_rows": self.burst_rows,
             "burst_s": self.burst_s,
             "sensors": self.sensors,

@@ -15,10 +15,12 @@ import numpy as np
 
 from offbeat.answers.predict import predict
 from offbeat.data.masking import mask_out
+from offbeat.data.scaler import Scaler
 from offbeat.data.simulate import available_cores, simulate
-from offbeat.data.splits import Scaler, split, windows
+from offbeat.data.splits import split
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.windows import windows
 from offbeat.errors import InputError, MissingExtraError
 from offbeat.evaluation import LAST_VALUE, Evaluation, evaluate
 from offbeat.files import write_json, write_text

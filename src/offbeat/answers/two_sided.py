@@ -126,7 +126,7 @@ def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int 
     """
     validation = transforms_of(forward).apply(in_model_order(forward, validation))
     if not any(masked_values(t).any() for t in validation):
-        validation = mask_out(validation, 0.7, hide="cells", seed=seed)
+        validation = mask_out(validation, 0.7, mask="values", seed=seed)
     scale = np.abs(forward.scaler.scale) * np.array(forward.statistics.std)
     equations = NormalEquations(forward.channels, forward.statistics.median_gap)
     every = zip(validation, _sides(forward, backward, validation, seed), strict=True)

@@ -12,7 +12,7 @@ from offbeat.cli.common import (
     read_log,
     say,
 )
-from offbeat.config import HIDINGS, check_seed
+from offbeat.config import MASKS, check_seed
 from offbeat.errors import InputError, one_of
 
 
@@ -21,7 +21,7 @@ def evaluate_command(
     data: Path,
     part: str | None = None,
     observed_fraction: float | None = None,
-    hide: str = "rows",
+    mask: str = "rows",
     burst_rows: int | None = None,
     burst_s: float | None = None,
     horizons: list[float] | float | None = None,
@@ -45,8 +45,8 @@ def evaluate_command(
         part: test, validation, train or all. On the data that the run was trained on, the same
             windows, hidden rows and split are made again, and test is the default; other data can
             only be scored as a whole.
-        observed_fraction: hide cells of other data at random, this share stays observed.
-        hide: how: rows, cells, bursts or dropout.
+        observed_fraction: mask values of other data at random; this fraction stays observed.
+        mask: how: rows, values, bursts or dropout.
         burst_rows: rows of a burst or of a silence.
         burst_s: its length in s, instead.
         horizons: s, to score extrapolation at: --horizons 0.5 or --horizons '[0.1, 0.5]'.
@@ -71,7 +71,7 @@ def evaluate_command(
     if part is not None:
         one_of("part", part, ("train", "validation", "test", "all"))
     check_seed(seed)
-    one_of("way of hiding", hide, HIDINGS)
+    one_of("mask", mask, MASKS)
     check_figure(figure)
     after = None if horizons is None else checked_horizons(horizons).tolist()
     loaded = load_run(model)
@@ -96,7 +96,7 @@ def evaluate_command(
             dataset = mask_out(
                 dataset,
                 observed_fraction,
-                hide=hide,  # type: ignore[arg-type]
+                mask=mask,  # type: ignore[arg-type]
                 burst_rows=burst_rows,
                 burst_s=burst_s,
                 seed=seed,

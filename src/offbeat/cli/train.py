@@ -51,7 +51,8 @@ def train_command(
     from offbeat.answers.impute import fit_two_sided
     from offbeat.answers.two_sided import TwoSided
     from offbeat.cli.scored import scored
-    from offbeat.data.splits import SCALERS, apply_split, save_split
+    from offbeat.data.scaler import SCALERS
+    from offbeat.data.splits import apply_split, save_split
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
     from offbeat.models.model import Model

@@ -103,9 +103,9 @@ def _parts(
         parts["cut"] = "consecutive"
         reasons.append(f"split by episode (the default), for there are {episodes}")
     else:
-        parts["split"] = "in_time"
+        parts["by"] = "time"
         reasons.append(
-            f"split in time: {episodes} episode{'s are' if episodes > 1 else ' is'} too few to "
+            f"by time: {episodes} episode{'s are' if episodes > 1 else ' is'} too few to "
             "share out whole; the last rows are the test"
         )
     parts["observed_fraction"] = 0.7
@@ -114,22 +114,22 @@ def _parts(
     usual = 1 / min(rates) if rates else 0.0
     uneven = masked or len({round(channel.missing, 4) for channel in useful}) > 1
     if uneven:
-        parts["hide"] = "dropout"
+        parts["mask"] = "dropout"
         silence = max(min(gap, 20 * usual), 3 * usual)
         parts["burst_s"] = float(f"{silence:.2g}")
         reasons.append(
-            f"hide: sensors speak at times of their own, so each falls silent on its own, for "
+            f"mask: sensors speak at times of their own, so each falls silent on its own, for "
             f"{parts['burst_s']:g} s (longest gap of the median channel: {gap:.3g} s)"
         )
     elif gap > 5 * usual:
-        parts["hide"] = "bursts"
+        parts["mask"] = "bursts"
         parts["burst_s"] = float(f"{min(gap, 20 * usual):.2g}")
         reasons.append(
-            f"hide: all channels stop together for up to {gap:.3g} s, so bursts of "
+            f"mask: all channels stop together for up to {gap:.3g} s, so bursts of "
             f"{parts['burst_s']:g} s are hidden to be filled and scored"
         )
     else:
-        reasons.append("hide: 30 % of the rows at random, all channels together (the default)")
+        reasons.append("mask: 30 % of the rows at random, all channels together (the default)")
     return parts, reasons
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
 

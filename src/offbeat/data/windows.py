@@ -102,7 +102,7 @@ class _Span:
         """(rows,) where a window that starts at each row stops; may lie beyond the end."""
         if self.rows is not None:
             return np.arange(len(times)) + self.rows
-        # A grid of 5 ms has 200 rows in a second, whatever the last bits of its times are.
+        # With a tolerance: a window of 1 s has 200 rows on a grid of 5 ms.
         return np.asarray(np.searchsorted(times, times + self.seconds * (1 - 1e-9)))
 
     def fits(self, times: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.errors import FileFormatError, require
 from offbeat.stream.engine import Arrays, Engine
 from offbeat.stream.live import Frame, LiveStream

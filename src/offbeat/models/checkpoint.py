@@ -14,7 +14,7 @@ from safetensors.torch import save as dump_tensors
 from torch import Tensor
 
 from offbeat.config import ModelConfig, from_mapping
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.errors import FileFormatError
 from offbeat.files import atomic_folder
 from offbeat.models.model import Model

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from offbeat.config import ModelConfig
 from offbeat.data.batch import Batch
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
 from offbeat.kernels import ScanSpec, ScanWeights, StepInputs, TableSteps, backend, cpu, scan

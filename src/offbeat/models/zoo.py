@@ -7,7 +7,7 @@ from typing import Any
 
 from offbeat.config import ModelConfig, TrainConfig, from_mapping
 from offbeat.data.batch import Batch
-from offbeat.data.splits import Scaler, ScalerKind, check_observed
+from offbeat.data.scaler import Scaler, ScalerKind, check_observed
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
 from offbeat.models.model import Model

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.errors import DivergenceError, InputError
 from offbeat.stream.engine import Engine
 from offbeat.stream.messages import RowReader, Time, Values

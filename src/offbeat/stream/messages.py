@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import SECONDS_PER
 from offbeat.errors import InputError, one_of
 

@@ -19,7 +19,7 @@ import torch
 from tqdm import tqdm
 
 from offbeat.config import TrainConfig
-from offbeat.data.splits import Scaler
+from offbeat.data.scaler import Scaler
 from offbeat.data.store import load
 from offbeat.errors import OffbeatError
 from offbeat.models.zoo import make_model

@@ -1,0 +1,126 @@
+"""Scaling of values, per channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.arrays import frozen
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import InputError, one_of
+
+ScalerKind = Literal["standardise", "min_max", "divide_by_max", "identity"]
+SCALERS: tuple[str, ...] = ("standardise", "min_max", "divide_by_max", "identity")
+
+
+@dataclass(frozen=True, eq=False)
+class Scaler:
+    """An affine map per channel: scaled = (value - shift) / scale.
+
+    It is fitted on the training part and saved with the model. It owns its arrays, which are
+    read-only.
+
+    Args:
+        kind: `standardise`, `min_max`, `divide_by_max` or `identity`.
+        shift: (channels,) in the channels' units.
+        scale: (channels,) in the channels' units, not zero.
+    """
+
+    kind: str
+    shift: NDArray[np.float64]
+    scale: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        one_of("scaler", self.kind, SCALERS)
+        shift = frozen(self.shift, np.float64)
+        scale = frozen(self.scale, np.float64)
+        if shift.ndim != 1 or shift.shape != scale.shape:
+            raise InputError(f"shift and scale need one shape, got {shift.shape}, {scale.shape}")
+        if not (np.isfinite(shift).all() and np.isfinite(scale).all() and (scale != 0).all()):
+            raise InputError("shift and scale must be finite, and scale not zero")
+        object.__setattr__(self, "shift", shift)
+        object.__setattr__(self, "scale", scale)
+
+    @classmethod
+    def identity(cls, channels: int) -> Scaler:
+        """Leaves values as they are."""
+        return cls("identity", np.zeros(channels), np.ones(channels))
+
+    @classmethod
+    def fit(cls, kind: str, dataset: Dataset) -> Scaler:
+        """Fits a scaler to the observed values of a data set, per channel.
+
+        Args:
+            kind: `standardise`, (x - mean) / standard deviation; `min_max`, (x - min) / (max -
+                min); `divide_by_max`, (x - min) / max, the normalisation of the thesis, kept for
+                comparison; or `identity`.
+            dataset: the training part.
+
+        Raises:
+            InputError: a channel is never observed, or its maximum is 0 under `divide_by_max`.
+        """
+        one_of("scaler", kind, SCALERS)
+        count, mean, square, low, high = moments(dataset)
+        check_observed(dataset.names, count, len(dataset))
+        if kind == "identity":
+            return cls.identity(dataset.channels)
+        if kind == "standardise":
+            deviation = np.sqrt(square)
+            # The scale of a constant channel stays 1.
+            return cls(kind, mean, np.where(deviation > 1e-12 * np.abs(mean), deviation, 1.0))
+        if kind == "min_max":
+            return cls(kind, low, np.where(high > low, high - low, 1.0))
+        if (high == 0).any():
+            name = dataset.names[int((high == 0).argmax())]
+            raise InputError(
+                f"divide_by_max: the maximum of channel {name!r} is 0; use 'min_max' instead"
+            )
+        return cls(kind, low, high)
+
+    def scaled(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., channels) original units to scaled ones."""
+        return (values - self.shift) / self.scale
+
+    def original(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., channels) scaled values to original units."""
+        return values * self.scale + self.shift
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-like form; floats survive to the last bit."""
+        return {"kind": self.kind, "shift": self.shift.tolist(), "scale": self.scale.tolist()}
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> Scaler:
+        """The inverse of `to_dict`."""
+        return cls(value["kind"], np.array(value["shift"]), np.array(value["scale"]))
+
+
+def check_observed(names: Sequence[str], count: NDArray[np.int64], trajectories: int) -> None:
+    """Checks that each channel has an observed value.
+
+    Raises:
+        InputError: a channel has none; the message names all of them.
+    """
+    if (count == 0).any():
+        never = [name for name, n in zip(names, count, strict=True) if n == 0]
+        raise InputError(
+            f"never observed in {trajectories} training trajectories: {', '.join(never)}; leave "
+            "such channels out, nothing can be learned about them"
+        )
+
+
+def moments(dataset: Dataset) -> tuple[NDArray[Any], ...]:
+    """Count, mean, variance, minimum and maximum of the observed values, per channel."""
+    values = np.concatenate([t.values for t in dataset])
+    observed = np.concatenate([t.observed for t in dataset])
+    count = observed.sum(axis=0)
+    safe = np.maximum(count, 1)
+    mean = np.where(observed, values, 0).sum(axis=0) / safe
+    variance = (np.where(observed, values - mean, 0) ** 2).sum(axis=0) / safe
+    low = np.where(observed, values, np.inf).min(axis=0)
+    high = np.where(observed, values, -np.inf).max(axis=0)
+    return count, mean, variance, low, high
