@@ -6,7 +6,7 @@ Torch and everything else that is slow to import is imported inside the function
 
 from __future__ import annotations
 
-import json
+import inspect
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -57,12 +57,8 @@ COMMANDS: dict[str, Any] = {
     "doctor": doctor_command,
 }
 
-# Commands that take any number of paths, as a shell hands them over.
-MANY_PATHS = ("compare",)
-
-
-FLAGS = ("--json", "--stats", "--tiny")
-"""Options that need no value."""
+ALIASES = {"forecast": ("extrapolate",)}
+"""Other names of commands."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -85,84 +81,43 @@ def run_commands(
         prog: the program's name.
         description: for its help.
     """
-    from jsonargparse import ArgumentError, auto_cli, set_parsing_settings
+    from argparse import ArgumentError
 
-    # No value, from a file or typed, may name a class or a function that is then called.
-    set_parsing_settings(instantiate_subclass_spec_in_any=False, import_path_denylist=["*"])
-    arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
-    # Flags, although options made from bool arguments want a value.
-    arguments = [f"{argument}=true" if argument in FLAGS else argument for argument in arguments]
-    if arguments == ["--version"]:
-        from offbeat import __version__
+    from offbeat import __version__
+    from offbeat.cli.option_groups import reader_options, training_options
+    from offbeat.cli.parser import CommandParser
 
-        print(f"offbeat {__version__}")
-        return 0
-    arguments = _gather_paths(_configs_first(arguments))
+    groups = {"reader": reader_options, "training": training_options}
+    parser = CommandParser(prog=prog, description=description, version=__version__)
+    subcommands = parser.add_subcommands()
+    names, parsers = {}, {}
+    for command, function in commands.items():
+        about = inspect.cleandoc(function.__doc__ or "").partition("\n\n")[0]
+        parsers[command] = CommandParser(function, groups, description=about)
+        aliases = ALIASES.get(command, ())
+        subcommands.add_subcommand(command, parsers[command], help=about, aliases=aliases)
+        parsers[command].prog = f"{prog} {command}"
+        names |= dict.fromkeys((command, *aliases), command)
+    command = ""
     try:
-        auto_cli(
-            commands,
-            args=arguments,
-            prog=prog,
-            description=description,
-            formatter_class=_formatter(),
-            exit_on_error=False,
-        )
+        parsed = parser.parse_args(list(sys.argv[1:] if argv is None else argv) or ["--help"])
+        command = names[parsed.subcommand]
+        options = parser.instantiate(parsed)[parsed.subcommand].as_dict()
+        options.pop("config", None)
+        commands[command](**options)
     except ArgumentError as error:
         return _fail(str(error), 2)
+    except RecursionError:
+        return _fail("a value is nested too deeply", 2)
     except (OffbeatError, OSError) as error:
-        return _fail(str(error), 1 if isinstance(error, ArithmeticError) else 2)
+        said = parsers[command].spoken(str(error)) if command else str(error)
+        return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
     except KeyboardInterrupt:
-        return _fail("interrupted; the same command goes on from the last checkpoint", 130)
+        return _fail("interrupted; the same command continues from the last checkpoint", 130)
     return 0
-
-
-def _configs_first(arguments: list[str]) -> list[str]:
-    """Puts `--config FILE` before all else: what is typed wins over the file, in any order."""
-    command, rest = arguments[:1], arguments[1:]
-    configs: list[str] = []
-    while any(a == "--config" or a.startswith("--config=") for a in rest):
-        at = next(i for i, a in enumerate(rest) if a == "--config" or a.startswith("--config="))
-        width = 2 if rest[at] == "--config" else 1
-        configs += rest[at : at + width]
-        rest = rest[:at] + rest[at + width :]
-    return [*command, *configs, *rest]
-
-
-def _gather_paths(arguments: list[str]) -> list[str]:
-    """Makes one argument of the paths of a command that takes many: a list, as jsonargparse reads.
-
-    Each option but --help stands before its value, or holds it after an equals sign.
-    """
-    command, rest = arguments[:1], arguments[1:]
-    if not command or command[0] not in MANY_PATHS:
-        return arguments
-    paths: list[str] = []
-    options: list[str] = []
-    while rest:
-        first = rest.pop(0)
-        if not first.startswith("-"):
-            paths.append(first)
-            continue
-        options.append(first)
-        alone = "=" in first or first in ("-h", "--help") or first.startswith("--print_config")
-        if not alone and rest:
-            options.append(rest.pop(0))
-    return [*command, *([json.dumps(paths)] if paths else []), *options]
 
 
 def _fail(message: str, code: int) -> int:
     line = " ".join(message.split())
     print(f"offbeat: error: {line}", file=sys.stderr)
     return code
-
-
-def _formatter() -> type:
-    from jsonargparse import DefaultHelpFormatter
-
-    class Formatter(DefaultHelpFormatter):
-        """Leaves the lines of the description as they are."""
-
-        def _fill_text(self, text: str, width: int, indent: str) -> str:
-            return "".join(indent + line for line in text.splitlines(keepends=True))
-
-    return Formatter

@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.cli.common import READER_FILE, plain, read_log, say
-from offbeat.config import ModelConfig, SplitConfig, TrainConfig, check_seed
+from offbeat.config import ModelConfig, SplitConfig, check_seed
 from offbeat.errors import InputError, one_of
 
 LONG = 2000
-"""Rows of a training trajectory from which on it is worth a word that windows train faster."""
+"""Rows of a training trajectory above which a note recommends windows."""
 
 
 def train_command(
     data: Path,
     out: Path,
     model: ModelConfig = ModelConfig(),  # noqa: B008  # frozen
-    training: TrainConfig = TrainConfig(),  # noqa: B008
+    training: dict[str, Any] | None = None,
     split: SplitConfig = SplitConfig(),  # noqa: B008
     scaler: str = "standardise",
     two_sided: bool = False,
@@ -28,18 +28,21 @@ def train_command(
     threads: int = 1,
     json: bool = False,
 ) -> None:
-    """Train a model on a data set, and score it on the part that was held out.
+    """Train a model on a data set, and score it on the test part.
+
+    Each model has a training recipe of its own; options of the training that are not given are
+    those of the recipe. The weights with the best validation error are kept.
 
     Args:
         data: the log, of any format that Offbeat reads.
         out: folder of the run: config.yaml, log.csv, checkpoints, model, results.json. A run that
-            was stopped goes on where it was.
+            was stopped continues from its last checkpoint.
         model: what the model consists of; only the name is needed.
-        training: epochs, optimizer and the rest.
-        split: windows, masked cells, and the split into training, validation and test.
+        training: epochs, optimizer and the rest, where they differ from the model's recipe.
+        split: windows, masked values, and the split into training, validation and test part.
         scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
-        two_sided: train a second model on reversed trajectories, too, so that impute can fill from
-            both sides; it lies in the folder backward of the run.
+        two_sided: train a second model on reversed trajectories as well, so that impute can fill
+            from both sides; it is saved in the folder backward of the run.
         reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
@@ -56,7 +59,7 @@ def train_command(
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
     from offbeat.models.model import Model
-    from offbeat.models.zoo import make_model
+    from offbeat.models.zoo import make_model, train_config
     from offbeat.training import fit
 
     one_of("scaler", scaler, SCALERS)
@@ -64,6 +67,7 @@ def train_command(
     if threads < 1:
         raise InputError(f"threads must be an integer of at least 1, got {threads}")
     writable(out, folder=True)
+    config = train_config(model.name, **{"keep": "best", **(training or {})})
     torch.set_num_threads(threads)
     dataset = read_log(data, reader)
     train_part, validation, test = apply_split(dataset, split)
@@ -79,7 +83,7 @@ def train_command(
         "data": str(data),
         "out": str(out),
         "model": plain(asdict(made.config)),
-        "training": plain(asdict(training)),
+        "training": plain(asdict(config)),
         "split": plain(asdict(split)),
         "scaler": scaler,
         "two_sided": two_sided,
@@ -90,10 +94,10 @@ def train_command(
     trained: Model | TwoSided = made
     if two_sided:
         trained, fitted, _ = fit_two_sided(
-            made, train_part, validation, training, out=out, seed=seed
+            made, train_part, validation, config, out=out, seed=seed
         )
     else:
-        fitted = fit(made, train_part, validation, training, out=out)
+        fitted = fit(made, train_part, validation, config, out=out)
     write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
     save_split(out / "split.json", split, dataset)
     if reader:

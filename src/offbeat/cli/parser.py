@@ -1,0 +1,250 @@
+"""The parser of a command: its options are the arguments of a function.
+
+Made of jsonargparse, with four rules of our own. A boolean option is a flag, which may also be
+given as `--flag=true` or `--flag=false`. A list may be typed as `a,b,c`. What is typed wins over
+what stands in a config, in any order. No value names a class or a function that is then called.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import inspect
+import re
+from argparse import SUPPRESS, ArgumentError
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn, NotRequired
+
+import yaml
+from jsonargparse import (
+    ActionConfigFile,
+    ArgumentParser,
+    DefaultHelpFormatter,
+    Namespace,
+    get_loader,
+    set_loader,
+    set_parsing_settings,
+)
+
+set_parsing_settings(
+    instantiate_subclass_spec_in_any=False,
+    import_path_denylist=["*"],
+    add_print_completion_argument=True,
+)
+
+MOST_BYTES, MOST_NODES, DEEPEST = 1_000_000, 100_000, 50
+"""Bounds of a config: its size, its values once aliases are expanded, its nesting."""
+
+
+class Option(NamedTuple):
+    """An option that has no default: where it is not given, the command does not hear of it."""
+
+    name: str
+    type: Any
+    help: str
+
+
+class Formatter(DefaultHelpFormatter):
+    """Leaves the lines of the description as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "".join(indent + line for line in text.splitlines(keepends=True))
+
+
+class CommandParser(ArgumentParser):
+    """The parser of one command.
+
+    Args:
+        function: the command; the first paragraph of its docstring is the description, the names
+            under `Args:` are the options.
+        groups: options of an argument that is a mapping, by the argument's name, made when they are
+            needed.
+        **options: of `jsonargparse.ArgumentParser`.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., None] | None = None,
+        groups: Mapping[str, Callable[[], Sequence[Option]]] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(formatter_class=Formatter, exit_on_error=False, **options)
+        self.function, self.groups_of, self.is_filled = function, groups or {}, False
+
+    def fill(self) -> None:
+        """Adds the options of the function, once; the command that runs alone needs them."""
+        if self.is_filled or self.function is None:
+            return
+        self.is_filled = True
+        self.add_argument("--config", action=_Config, help="YAML file with options.")
+        groups = self.groups_of.keys() & inspect.signature(self.function).parameters.keys()
+        self.add_function_arguments(
+            self.function, as_group=False, as_positional=True, sub_configs=True, skip=set(groups)
+        )
+        for name in sorted(groups):
+            self.add_function_arguments(_function_of(self.groups_of[name]()), name)
+        for action in list(self._actions):
+            kind = getattr(action, "_typehint", action.type)
+            if kind in (bool, bool | None) and action.option_strings:
+                self._make_flag(action)
+            elif re.search(r"\b(list|tuple|Sequence)\[", str(kind)):
+                if action.option_strings:
+                    action.type = _Listed(kind)
+                else:  # any number of them, as a shell hands them over
+                    action._typehint, action.nargs, action.metavar = kind.__args__[0], "+", None
+        paths = (a.metavar or a.dest for a in self._actions if not a.option_strings)
+        self.usage = f"{self.prog} [options] {' '.join(paths)}"
+
+    def _make_flag(self, action: argparse.Action) -> None:
+        """Lets an option of type bool stand alone, or with `=true` or `=false`."""
+        action.nargs = 0
+        (name,) = action.option_strings
+        for text, value in (("", True), ("=true", True), ("=false", False)):
+            self._option_string_actions[name + text] = argparse._StoreConstAction(
+                [name], action.dest, const=value
+            )
+
+    def parse_args(self, args: Any = None, namespace: Any = None, **options: Any) -> Namespace:
+        """Parses what was typed; values of a config count where nothing was typed."""
+        self.fill()
+        if self.function is not None:
+            first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+            first.add_argument("--config", action="append", default=[])
+            configs = first.parse_known_args(args)[0].config
+            for config in configs:
+                namespace = self._read(Path(config), namespace)
+        return super().parse_args(args, namespace, **options)
+
+    def _read(self, path: Path, before: Namespace | None) -> Namespace:
+        try:
+            if path.stat().st_size > MOST_BYTES:
+                raise yaml.YAMLError(f"it is larger than {MOST_BYTES} bytes")
+            values = _load(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeError, yaml.YAMLError) as error:
+            raise ArgumentError(None, f"the config {path} can't be read: {error}") from None
+        if not isinstance(values, dict):
+            raise ArgumentError(None, f"the config {path} must hold options by name")
+        values = {name: value for name, value in values.items() if value is not None}
+        try:
+            return self.parse_object(
+                values, before, defaults=False, _skip_validation=True, _skip_required=True
+            )
+        except ArgumentError as error:
+            raise ArgumentError(None, f"the config {path}: {error}") from None
+
+    def get_completion_script(self, completion_type: str, **options: Any) -> str:
+        """The script for a shell that completes commands, options and choices."""
+        for command in self._subcommands_action._name_parser_map.values():
+            command.fill()
+        return super().get_completion_script(completion_type, **options)
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Raises one line, with the nearest option where one is unknown."""
+        unknown = re.search(r"unrecognized arguments: --([\w.]+)", message, re.IGNORECASE)
+        unknown = unknown or re.search(r"does not accept option '([\w.]+)'", message)
+        if unknown:
+            known = [name for name in self._option_string_actions if "=" not in name]
+            near = difflib.get_close_matches(f"--{unknown[1]}", known, n=1, cutoff=0.7)
+            message += f"; did you mean {near[0]!r}?" if near else ""
+        elif re.search(r"unrecognized arguments: (true|false)\b", message, re.IGNORECASE):
+            message += "; a flag takes its value after an equals sign: --flag=true"
+        message = message.replace(
+            "ignored explicit argument", "stands alone, or takes =true or =false, not"
+        )
+        super().error(message, ex)
+
+    def spoken(self, message: str) -> str:
+        """A message of the library in the words of the command line.
+
+        `window_s=0.5` becomes `--split.window_s 0.5`, and a name at the start of the message the
+        option.
+        """
+        named: dict[str, set[str]] = {}
+        for option in self._option_string_actions:
+            if option.startswith("--") and not set("=+") & set(option):
+                named.setdefault(option.lstrip("-").split(".")[-1], set()).add(option)
+        for name, options in named.items():
+            if len(options) > 1:
+                continue
+            (option,) = options
+            message = re.sub(rf"(?<![\w.\-'\"]){name}=(?=[\w'\"])", f"{option} ", message)
+            message = re.sub(rf"(?<![\w.\-'\"]){name}=", option, message)
+            exact = rf"(?<![\w.\-'\"|]){name}(?![\w.='\"|])" if "_" in name else rf"^{name}(?= must)"
+            message = re.sub(exact, option, message)
+        return message
+
+
+class _Config(ActionConfigFile):
+    """Read before what is typed, so there is nothing left to do for it."""
+
+    def __call__(self, *_: Any) -> None:
+        pass
+
+
+class _Listed:
+    """Takes a list as `a,b,c`, beside what YAML has for lists."""
+
+    def __init__(self, kind: Any) -> None:
+        self.kind = kind
+
+    def __call__(self, text: str) -> Any:
+        return text if text[:1] in ("[", "{", '"') or text == "null" else text.split(",")
+
+    def __repr__(self) -> str:
+        return re.sub(r"\b[a-z_]+\.(?=\w)", "", str(self.kind)).replace("NoneType", "null")
+
+
+def _function_of(options: Sequence[Option]) -> Callable[..., None]:
+    """A function that has these options as its arguments, none of which has a default."""
+
+    def function() -> None:
+        pass
+
+    function.__doc__ = "\n".join(
+        ["Options.", "", "Args:", *(f"    {option.name}: {option.help}" for option in options)]
+    )
+    function.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(
+                option.name, inspect.Parameter.KEYWORD_ONLY, annotation=NotRequired[option.type]
+            )
+            for option in options
+        ]
+    )
+    return function
+
+
+def _checked(load: Callable[[str], Any]) -> Callable[[str], Any]:
+    """A loader of YAML that refuses what would take all memory or stack."""
+
+    def checked(text: str) -> Any:
+        try:
+            node = yaml.compose(text, yaml.SafeLoader)
+            if node is not None:
+                _count(node, 0, {})
+            return load(text)
+        except RecursionError:
+            raise yaml.YAMLError(f"it is nested more than {DEEPEST} deep") from None
+
+    return checked
+
+
+def _count(node: yaml.Node, depth: int, seen: dict[int, int]) -> int:
+    if depth > DEEPEST:
+        raise yaml.YAMLError(f"it is nested more than {DEEPEST} deep")
+    if id(node) not in seen:
+        seen[id(node)] = MOST_NODES  # an alias to a node that it stands in
+        inside: list[yaml.Node] = []
+        if isinstance(node, yaml.SequenceNode):
+            inside = node.value
+        elif isinstance(node, yaml.MappingNode):
+            inside = [part for pair in node.value for part in pair]
+        seen[id(node)] = 1 + sum(_count(part, depth + 1, seen) for part in inside)
+    if seen[id(node)] > MOST_NODES:
+        raise yaml.YAMLError(f"it holds more than {MOST_NODES} values once aliases are expanded")
+    return seen[id(node)]
+
+
+_load = _checked(get_loader("yaml"))
+set_loader("yaml", _load, (yaml.YAMLError,))
