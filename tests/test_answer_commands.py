@@ -224,7 +224,7 @@ def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
         (["impute", run, log, out, "--figure=a.gif"], "suffix of figure"),
         (["impute", run, log, out, "--channels=[tilts]"], "did you mean 'tilt'"),
         (["impute", run, log, out, "--trajectory=1"], "there is no trajectory 1"),
-        (["impute", run, log, out, "--reader.time_col=stamp"], "did you mean 'time_column'"),
+        (["impute", run, log, out, "--reader.time_col=stamp"], "did you mean '--reader.time_column'"),
         (["impute", run, log, out, "--reader.format=cvs"], "did you mean 'csv'"),
         (["forecast", run, log, out], "horizons"),
         (["forecast", run, log, out, "--horizons=0"], "above 0"),

@@ -6,13 +6,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 import offbeat as ob
-from offbeat.cli.app import COMMANDS, main
+from offbeat.cli.app import COMMANDS, main, run_commands
 
 SMALL = [
     "--model.name=gru", "--model.hidden_size=4", "--training.epochs=1", "--training.batch_size=8",
@@ -111,6 +112,93 @@ def test_what_is_typed_wins_over_a_config_in_any_order(run, data, tmp_path):
     assert (run / "results.json").read_bytes() == before
 
 
+def parsed(*arguments: str) -> dict[str, Any]:
+    """What a command would be given."""
+    given: dict[str, Any] = {}
+
+    def command(
+        paths: list[str],
+        model: ob.ModelConfig = ob.ModelConfig(),  # noqa: B008
+        horizons: list[float] | float | None = None,
+        channels: list[str] | None = None,
+        two_sided: bool = False,
+        json: bool = True,
+        seed: int = 0,
+        training: dict[str, Any] | None = None,
+        reader: dict[str, Any] | None = None,
+    ) -> None:
+        """Take options."""
+        given.update(locals())
+
+    assert run_commands({"go": command}, ["go", *arguments], prog="test", description="") == 0
+    return given
+
+
+@pytest.mark.parametrize(
+    ("typed", "name", "value"),
+    [
+        (["--two_sided"], "two_sided", True),
+        (["--two_sided=true"], "two_sided", True),
+        (["--two_sided=false"], "two_sided", False),
+        (["--json=false"], "json", False),
+        (["--horizons", "0.1,0.5"], "horizons", [0.1, 0.5]),
+        (["--horizons=[0.1, 0.5]"], "horizons", [0.1, 0.5]),
+        (["--horizons", "1e-3"], "horizons", [0.001]),
+        (["--channels", "q[0],q[1]"], "channels", ["q[0]", "q[1]"]),
+        (["--channels", '["a,b"]'], "channels", ["a,b"]),
+        (["--model.field_units", "3,4"], "model", ob.ModelConfig(field_units=(3, 4))),
+        (["--model.anchored"], "model", ob.ModelConfig(anchored=True)),
+        (["--model.anchored=false"], "model", ob.ModelConfig(anchored=False)),
+        ([], "reader", None),
+        (["--reader.max_gap_s", "null"], "reader", {"max_gap_s": None}),
+        (["--reader", '{"max_gap_s": 2, "format": "csv"}'], "reader",
+         {"max_gap_s": 2.0, "format": "csv"}),
+        (["--reader.units", '{"a": "m"}'], "reader", {"units": {"a": "m"}}),
+        (["--reader.episodes", "1,2"], "reader", {"episodes": [1, 2]}),
+        (["--reader.unwrap=false"], "reader", {"unwrap": False}),
+        (["--training.epochs=3"], "training", {"epochs": 3}),
+    ],
+)  # fmt: skip
+def test_flags_lists_and_groups_are_read_as_they_are_typed(typed, name, value):
+    assert parsed("a", "b", *typed)[name] == value
+    before = parsed(*typed, "a", "b")
+    assert (before[name], before["paths"]) == (value, ["a", "b"])
+
+
+def test_a_config_counts_where_nothing_is_typed_before_or_after_it(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(
+        "paths: [c]\nseed: 5\ntwo_sided: true\nhorizons: 0.5\nmodel: {name: gru, hidden_size: 3}\n"
+        "reader: {held: mask, max_gap_s: null}\ntraining: null\n"
+    )
+    config = f"--config={path}"
+    alone = parsed(config)
+    assert (alone["paths"], alone["seed"], alone["two_sided"]) == (["c"], 5, True)
+    assert (alone["horizons"], alone["training"]) == (0.5, None)
+    assert alone["reader"] == {"held": "mask", "max_gap_s": None}
+    typed = [
+        "a",
+        "b",
+        "--seed=0",
+        "--model.hidden_size=4",
+        "--two_sided=false",
+        "--reader.held=keep",
+    ]
+    for arguments in (
+        [config, *typed],
+        [*typed, config],
+        [*typed[:4], "--config", str(path), *typed[4:]],
+    ):
+        got = parsed(*arguments)
+        assert (got["paths"], got["seed"], got["two_sided"]) == (["a", "b"], 0, False)
+        assert got["model"] == ob.ModelConfig(name="gru", hidden_size=4)
+        assert got["reader"] == {"held": "keep", "max_gap_s": None}
+    second = tmp_path / "second.yaml"
+    second.write_text("seed: 6\n")
+    both = parsed(config, "--config", str(second))
+    assert (both["seed"], both["two_sided"]) == (6, True)
+
+
 def test_a_part_can_be_asked_for_on_the_data_of_the_run_alone(run, data, tmp_path, capsys):
     other = tmp_path / "other.parquet"
     ob.save(ob.simulate("hopper", 3, 30, seed=9, progress=False), other)
@@ -150,7 +238,7 @@ def test_print_config_prints_yaml_that_can_be_overridden(tmp_path, capsys):
         main(["train", "a.parquet", "out", "--model.name=ode_rnn", "--print_config"])
     config = yaml.safe_load(capsys.readouterr().out)
     assert config["model"]["name"] == "ode_rnn"
-    assert config["training"]["optimizer"] == "adamax"
+    assert config["split"]["observed_fraction"] is None
 
 
 def test_evaluate_scores_the_part_that_was_held_out_on_the_same_cells(run, data, capsys):

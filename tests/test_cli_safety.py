@@ -1,23 +1,126 @@
-"""Configs come from other people: no option may run what a config names."""
+"""Configs come from other people: no option may run what a config names, or take all memory."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from offbeat.cli.app import main
+import thesis.__main__
+from offbeat.cli import app
+from offbeat.cli.option_groups import reader_options, training_options
+from offbeat.cli.parser import CommandParser
+
+COMMANDS = [(app.main, name) for name in app.COMMANDS]
+COMMANDS += [(thesis.__main__.main, name) for name in thesis.__main__.COMMANDS]
 
 
-@pytest.mark.parametrize("command", ["inspect", "train", "evaluate", "predict", "impute"])
-@pytest.mark.parametrize("nested", [False, True])
-def test_a_config_cannot_run_a_command(command, nested, tmp_path, capsys):
-    marker = tmp_path / "marker"
-    hostile = {"class_path": "os.system", "init_args": {"command": f"touch {marker}"}}
-    config = tmp_path / "config.json"
-    config.write_text(json.dumps({"reader": {"x": hostile} if nested else hostile}))
-    paths = [str(tmp_path / name) for name in ("none", "none.csv", "out.csv")]
-    paths = {"inspect": paths[1:2], "train": paths[1:], "evaluate": paths[:2]}.get(command, paths)
-    assert main([command, *paths, "--config", str(config)]) == 2
-    assert not marker.exists()
-    assert len(capsys.readouterr().err.splitlines()) == 1
+def parser_of(command: str) -> CommandParser:
+    function = {**app.COMMANDS, **thesis.__main__.COMMANDS}[command]
+    groups = {"reader": reader_options, "training": training_options}
+    parser = CommandParser(function, groups, prog="offbeat")
+    parser.fill()
+    return parser
+
+
+def options_of(command: str) -> list[str]:
+    """The names of all options and paths of a command: `seed`, `split.window`, `split`."""
+    names = {action.dest for action in parser_of(command)._actions}
+    return sorted({*names, *(name.partition(".")[0] for name in names)} - {"help", "config"})
+
+
+def paths_of(command: str, folder: Path) -> list[str]:
+    """Paths for which every command stops before it has done anything."""
+    (folder / "file").touch()
+    at_fault = {"simulate": ["a.csv"], "doctor": [], "demo": ["--out=file"], "run": ["--out=file"]}
+    required = [a.dest for a in parser_of(command)._actions if not a.option_strings]
+    return at_fault.get(command, [f"file/{name}.csv" for name in required])
+
+
+@pytest.mark.parametrize(("main", "command"), COMMANDS)
+def test_no_option_of_any_command_runs_what_a_config_names(
+    main, command, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    paths = paths_of(command, tmp_path)
+    capsys.readouterr()
+    hostile = {"class_path": "os.system", "init_args": {"command": "touch marker"}}
+    for option in options_of(command):
+        for value in (hostile, {"x": hostile}) if "." not in option else (hostile,):
+            given: Any = value
+            for name in reversed(option.split(".")):
+                given = {name: given}
+            Path("config.yaml").write_text(json.dumps(given))
+            forms = [["--config=config.yaml"]]
+            if (
+                value is hostile and option != "out" and "." not in option
+            ):  # typed, that would name a file
+                forms += [[f"--{option}={json.dumps(value)}"]]
+            for arguments in forms:
+                assert main([command, *paths, *arguments]) == 2, (option, arguments)
+                error = capsys.readouterr().err
+                assert error.startswith("offbeat: error: "), (option, arguments)
+                assert len(error.splitlines()) == 1, (option, arguments)
+                assert not Path("marker").exists(), (option, arguments)
+
+
+@pytest.mark.parametrize("command", app.COMMANDS)
+def test_every_option_has_a_type_and_no_type_takes_anything(command):
+    for action in parser_of(command)._actions:
+        kind = str(getattr(action, "_typehint", action.type))
+        assert not any(word in kind for word in ("Any", "object", "Unvalidated")), action.dest
+
+
+BOMB = "a: &a [x, x]\n" + "".join(
+    f"{chr(98 + i)}: &{chr(98 + i)} [*{chr(97 + i)}, *{chr(97 + i)}]\n" for i in range(24)
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        BOMB,
+        "model: " + "[" * 100_000,
+        "seed: " + "{a: " * 200 + "1" + "}" * 200,
+        "seed: &a [*a]",
+        "reader: !!python/object/apply:os.system ['touch marker']",
+        "seed: [",
+        "- seed",
+        "",
+        "seed: \x00",
+        "x" * 2_000_000,
+    ],
+    ids=["aliases", "deep", "nested", "cycle", "tag", "cut", "list", "empty", "control", "long"],
+)
+def test_a_config_that_is_no_config_ends_in_one_line(text, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text(text)
+    assert app.main(["train", "none.csv", "out", "--config", "config.yaml"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("offbeat: error: ")
+    assert len(error.splitlines()) == 1
+    assert len(error) < 1000
+    assert not Path("marker").exists()
+
+
+@pytest.mark.parametrize("value", ["[" * 100_000, "{a: " * 200, BOMB])
+def test_a_typed_value_that_is_no_value_ends_in_one_line(value, tmp_path, capsys):
+    for option in ("--seed", "--reader", "--split.sensors", "--model", "--reader.units"):
+        assert app.main(["train", "none.csv", str(tmp_path / "out"), option, value]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_completion_knows_commands_options_and_choices(shell):
+    found = subprocess.run(
+        [sys.executable, "-m", "offbeat", f"--print_completion=shtab-{shell}"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for word in ("forecast", "extrapolate", "--two_sided", "--reader.time_unit", "dropout"):
+        assert word in found.stdout

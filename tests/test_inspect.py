@@ -97,7 +97,7 @@ def test_text_ends_in_advice_and_the_picture_shows_the_outage_as_white(faulty, t
 
 def test_an_option_that_the_format_does_not_have_is_refused_in_one_line(faulty, capsys):
     assert main(["inspect", str(faulty), "--reader.max_gap=1"]) == 2
-    assert "did you mean 'max_gap_s'" in capsys.readouterr().err
+    assert "did you mean '--reader.max_gap_s'" in capsys.readouterr().err
 
 
 def test_a_real_flight_log_shows_its_streams_gaps_and_dropouts():

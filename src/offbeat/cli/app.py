@@ -90,7 +90,8 @@ def run_commands(
     groups = {"reader": reader_options, "training": training_options}
     parser = CommandParser(prog=prog, description=description, version=__version__)
     subcommands = parser.add_subcommands()
-    names, parsers = {}, {}
+    names: dict[str, str] = {}
+    parsers: dict[str, CommandParser] = {}
     for command, function in commands.items():
         about = inspect.cleandoc(function.__doc__ or "").partition("\n\n")[0]
         parsers[command] = CommandParser(function, groups, description=about)

@@ -11,13 +11,13 @@ import argparse
 import difflib
 import inspect
 import re
-from argparse import SUPPRESS, ArgumentError
+from argparse import ArgumentError
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, NotRequired
 
 import yaml
-from jsonargparse import (
+from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first unseen
     ActionConfigFile,
     ArgumentParser,
     DefaultHelpFormatter,
@@ -33,8 +33,8 @@ set_parsing_settings(
     add_print_completion_argument=True,
 )
 
-MOST_BYTES, MOST_NODES, DEEPEST = 1_000_000, 100_000, 50
-"""Bounds of a config: its size, its values once aliases are expanded, its nesting."""
+MOST_CHARACTERS, MOST_VALUES, DEEPEST = 200_000, 20_000, 20
+"""Bounds of a config: its length, its values once aliases are expanded, its nesting."""
 
 
 class Option(NamedTuple):
@@ -69,7 +69,9 @@ class CommandParser(ArgumentParser):
         groups: Mapping[str, Callable[[], Sequence[Option]]] | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(formatter_class=Formatter, exit_on_error=False, **options)
+        super().__init__(
+            formatter_class=Formatter, exit_on_error=False, allow_abbrev=False, **options
+        )
         self.function, self.groups_of, self.is_filled = function, groups or {}, False
 
     def fill(self) -> None:
@@ -84,7 +86,8 @@ class CommandParser(ArgumentParser):
         )
         for name in sorted(groups):
             self.add_function_arguments(_function_of(self.groups_of[name]()), name)
-        for action in list(self._actions):
+        actions: list[Any] = list(self._actions)
+        for action in actions:
             kind = getattr(action, "_typehint", action.type)
             if kind in (bool, bool | None) and action.option_strings:
                 self._make_flag(action)
@@ -93,7 +96,7 @@ class CommandParser(ArgumentParser):
                     action.type = _Listed(kind)
                 else:  # any number of them, as a shell hands them over
                     action._typehint, action.nargs, action.metavar = kind.__args__[0], "+", None
-        paths = (a.metavar or a.dest for a in self._actions if not a.option_strings)
+        paths = (action.dest for action in actions if not action.option_strings)
         self.usage = f"{self.prog} [options] {' '.join(paths)}"
 
     def _make_flag(self, action: argparse.Action) -> None:
@@ -105,37 +108,51 @@ class CommandParser(ArgumentParser):
                 [name], action.dest, const=value
             )
 
-    def parse_args(self, args: Any = None, namespace: Any = None, **options: Any) -> Namespace:
+    def parse_args(  # type: ignore[override]
+        self, args: Any = None, namespace: Any = None, **options: Any
+    ) -> Namespace:
         """Parses what was typed; values of a config count where nothing was typed."""
         self.fill()
         if self.function is not None:
+            try:
+                _check_value([text.partition("=")[2] or text for text in args])
+            except yaml.YAMLError as error:
+                raise ArgumentError(None, f"a value can't be read: {error}") from None
             first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
             first.add_argument("--config", action="append", default=[])
             configs = first.parse_known_args(args)[0].config
             for config in configs:
                 namespace = self._read(Path(config), namespace)
-        return super().parse_args(args, namespace, **options)
+        try:
+            return super().parse_args(args, namespace, **options)
+        except ValueError as error:  # a value that names something to import
+            raise ArgumentError(None, str(error)) from None
 
     def _read(self, path: Path, before: Namespace | None) -> Namespace:
         try:
-            if path.stat().st_size > MOST_BYTES:
-                raise yaml.YAMLError(f"it is larger than {MOST_BYTES} bytes")
-            values = _load(path.read_text(encoding="utf-8"))
+            with path.open(encoding="utf-8") as file:
+                values = _load(file.read(MOST_CHARACTERS + 1))
+            _check_value(values)
         except (OSError, UnicodeError, yaml.YAMLError) as error:
             raise ArgumentError(None, f"the config {path} can't be read: {error}") from None
         if not isinstance(values, dict):
             raise ArgumentError(None, f"the config {path} must hold options by name")
         values = {name: value for name, value in values.items() if value is not None}
+        for action in self._actions:
+            if action.nargs == "+" and not isinstance(values.get(action.dest, []), list):
+                values[action.dest] = [values[action.dest]]
         try:
-            return self.parse_object(
+            read: Namespace = self.parse_object(
                 values, before, defaults=False, _skip_validation=True, _skip_required=True
             )
-        except ArgumentError as error:
+        except (ArgumentError, ValueError) as error:
             raise ArgumentError(None, f"the config {path}: {error}") from None
+        return read
 
     def get_completion_script(self, completion_type: str, **options: Any) -> str:
         """The script for a shell that completes commands, options and choices."""
-        for command in self._subcommands_action._name_parser_map.values():
+        subcommands: Any = self._subcommands_action
+        for command in subcommands._name_parser_map.values():
             command.fill()
         return super().get_completion_script(completion_type, **options)
 
@@ -170,7 +187,9 @@ class CommandParser(ArgumentParser):
             (option,) = options
             message = re.sub(rf"(?<![\w.\-'\"]){name}=(?=[\w'\"])", f"{option} ", message)
             message = re.sub(rf"(?<![\w.\-'\"]){name}=", option, message)
-            exact = rf"(?<![\w.\-'\"|]){name}(?![\w.='\"|])" if "_" in name else rf"^{name}(?= must)"
+            exact = (
+                rf"(?<![\w.\-'\"|]){name}(?![\w.='\"|])" if "_" in name else rf"^{name}(?= must)"
+            )
             message = re.sub(exact, option, message)
         return message
 
@@ -219,30 +238,64 @@ def _checked(load: Callable[[str], Any]) -> Callable[[str], Any]:
     """A loader of YAML that refuses what would take all memory or stack."""
 
     def checked(text: str) -> Any:
-        try:
-            node = yaml.compose(text, yaml.SafeLoader)
-            if node is not None:
-                _count(node, 0, {})
-            return load(text)
-        except RecursionError:
-            raise yaml.YAMLError(f"it is nested more than {DEEPEST} deep") from None
+        _check(text)
+        return load(text)
 
     return checked
 
 
-def _count(node: yaml.Node, depth: int, seen: dict[int, int]) -> int:
-    if depth > DEEPEST:
-        raise yaml.YAMLError(f"it is nested more than {DEEPEST} deep")
+def _check(text: str) -> None:
+    """Refuses a text that is too large, nested too deeply, or too large once aliases are expanded.
+
+    Raises:
+        yaml.YAMLError: it is, or it is no YAML.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise _Unsafe(f"it is longer than {MOST_CHARACTERS} characters")
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):  # the one pass of PyYAML without recursion
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise _Unsafe(f"it is nested more than {DEEPEST} deep")
+    node = yaml.compose(text, yaml.SafeLoader)
+    if node is not None:
+        _count(node, {})
+
+
+def _check_value(value: Any) -> None:
+    """Refuses a value in which a text would be taken for YAML that `_check` refuses."""
+    if isinstance(value, str) and len(value) > DEEPEST:  # shorter ones can't nest deeper
+        try:
+            _check(value)
+        except _Unsafe:
+            raise
+        except yaml.YAMLError:  # then it is no YAML, but a name or a sentence
+            pass
+    elif isinstance(value, dict):
+        for part in value.items():
+            _check_value(part)
+    elif isinstance(value, list | tuple):
+        for part in value:
+            _check_value(part)
+
+
+class _Unsafe(yaml.YAMLError):
+    """What would take all memory or stack."""
+
+
+def _count(node: yaml.Node, seen: dict[int, int]) -> int:
+    """The values in a node, those behind aliases counted each time."""
     if id(node) not in seen:
-        seen[id(node)] = MOST_NODES  # an alias to a node that it stands in
+        seen[id(node)] = MOST_VALUES + 1  # until it is known; an alias to a node around it stays so
         inside: list[yaml.Node] = []
         if isinstance(node, yaml.SequenceNode):
             inside = node.value
         elif isinstance(node, yaml.MappingNode):
             inside = [part for pair in node.value for part in pair]
-        seen[id(node)] = 1 + sum(_count(part, depth + 1, seen) for part in inside)
-    if seen[id(node)] > MOST_NODES:
-        raise yaml.YAMLError(f"it holds more than {MOST_NODES} values once aliases are expanded")
+        seen[id(node)] = 1 + sum(_count(part, seen) for part in inside)
+    if seen[id(node)] > MOST_VALUES:
+        raise _Unsafe(f"it holds more than {MOST_VALUES} values once aliases are expanded")
     return seen[id(node)]
 
 

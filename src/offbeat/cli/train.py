@@ -93,9 +93,7 @@ def train_command(
     }
     trained: Model | TwoSided = made
     if two_sided:
-        trained, fitted, _ = fit_two_sided(
-            made, train_part, validation, config, out=out, seed=seed
-        )
+        trained, fitted, _ = fit_two_sided(made, train_part, validation, config, out=out, seed=seed)
     else:
         fitted = fit(made, train_part, validation, config, out=out)
     write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
