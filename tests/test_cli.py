@@ -140,7 +140,10 @@ def parsed(*arguments: str) -> dict[str, Any]:
         (["--two_sided"], "two_sided", True),
         (["--two_sided=true"], "two_sided", True),
         (["--two_sided=false"], "two_sided", False),
+        (["--two_sided", "true"], "two_sided", True),
         (["--json=false"], "json", False),
+        (["--json", "false"], "json", False),
+        (["--json", "--seed=3"], "json", True),
         (["--horizons", "0.1,0.5"], "horizons", [0.1, 0.5]),
         (["--horizons=[0.1, 0.5]"], "horizons", [0.1, 0.5]),
         (["--horizons", "1e-3"], "horizons", [0.001]),
@@ -163,6 +166,11 @@ def test_flags_lists_and_groups_are_read_as_they_are_typed(typed, name, value):
     assert parsed("a", "b", *typed)[name] == value
     before = parsed(*typed, "a", "b")
     assert (before[name], before["paths"]) == (value, ["a", "b"])
+
+
+def test_a_flag_takes_true_or_false_alone(capsys):
+    error = one_line_error(capsys, "doctor", "--json=maybe")
+    assert "--json: stands alone, or takes =true or =false, not 'maybe'" in error
 
 
 def test_a_config_counts_where_nothing_is_typed_before_or_after_it(tmp_path):

@@ -99,14 +99,22 @@ class CommandParser(ArgumentParser):
         paths = (action.dest for action in actions if not action.option_strings)
         self.usage = f"{self.prog} [options] {' '.join(paths)}"
 
-    def _make_flag(self, action: argparse.Action) -> None:
-        """Lets an option of type bool stand alone, or with `=true` or `=false`."""
-        action.nargs = 0
-        (name,) = action.option_strings
-        for text, value in (("", True), ("=true", True), ("=false", False)):
-            self._option_string_actions[name + text] = argparse._StoreConstAction(
-                [name], action.dest, const=value
+    def _make_flag(self, option: argparse.Action) -> None:
+        """Lets an option of type bool stand alone, or with true or false."""
+        option.nargs = 0
+        (name,) = option.option_strings
+        self._option_string_actions[name] = _Flag([name], option.dest, nargs="?", const="true")
+        for text in ("true", "false"):
+            self._option_string_actions[f"{name}={text}"] = _Flag(
+                [name], option.dest, nargs=0, const=text
             )
+
+    def _match_argument(self, action: argparse.Action, pattern: str) -> int:
+        """How many of the strings that follow belong to an option; to a flag, true or false."""
+        if isinstance(action, _Flag):
+            following = self.args[len(self.args) - len(pattern) :][:1]
+            return int(action.nargs == "?" and following in (["true"], ["false"]))
+        return super()._match_argument(action, pattern)
 
     def parse_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None, **options: Any
@@ -160,12 +168,10 @@ class CommandParser(ArgumentParser):
         """Raises one line, with the nearest option where one is unknown."""
         unknown = re.search(r"unrecognized arguments: --([\w.]+)", message, re.IGNORECASE)
         unknown = unknown or re.search(r"does not accept option '([\w.]+)'", message)
-        if unknown:
+        if unknown and "did you mean" not in message:
             known = [name for name in self._option_string_actions if "=" not in name]
             near = difflib.get_close_matches(f"--{unknown[1]}", known, n=1, cutoff=0.7)
             message += f"; did you mean {near[0]!r}?" if near else ""
-        elif re.search(r"unrecognized arguments: (true|false)\b", message, re.IGNORECASE):
-            message += "; a flag takes its value after an equals sign: --flag=true"
         message = message.replace(
             "ignored explicit argument", "stands alone, or takes =true or =false, not"
         )
@@ -199,6 +205,13 @@ class _Config(ActionConfigFile):
 
     def __call__(self, *_: Any) -> None:
         pass
+
+
+class _Flag(argparse.Action):
+    """Sets a boolean option."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, _: Any = None) -> None:
+        setattr(namespace, self.dest, (values or self.const) == "true")
 
 
 class _Listed:
