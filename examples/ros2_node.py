@@ -121,17 +121,17 @@ def answer(
 
 def load(model: str) -> LiveStream:
     """A stream of the folder of a run, or of an exported file."""
-    policies: dict[str, Any] = {"late": "reorder", "time_unit": "ns"}
+    options: dict[str, Any] = {"late": "reorder", "time_unit": "ns"}
     if model.endswith(".onnx"):
         from offbeat import OnnxStream
 
-        return OnnxStream(model, **policies)
+        return OnnxStream(model, **options)
     import torch
 
     from offbeat import Stream, load_model
 
     torch.set_num_threads(1)
-    return Stream(load_model(model), **policies)
+    return Stream(load_model(model), **options)
 
 
 def main() -> None:

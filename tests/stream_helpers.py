@@ -9,7 +9,7 @@ import numpy as np
 
 from offbeat import Dataset, Model, Scaler, StreamOptions, Trajectory
 from offbeat.stream.engine import Engine
-from offbeat.stream.live import Frame, LiveStream
+from offbeat.stream.live import LiveStream, StreamInfo
 
 NAMES = ("a", "b", "c")
 
@@ -62,12 +62,10 @@ class Recorder(Engine):
 class Recorded(LiveStream):
     """A stream over a recorder, in original units."""
 
-    def __init__(self, *, time_unit: str = "s", **policies: Any) -> None:
+    def __init__(self, *, time_unit: str = "s", **options: Any) -> None:
         self.recorder = Recorder()
-        frame = Frame(NAMES, ("m",) * 3, Scaler.identity(3), median_gap=0.1, elapsed_limit=2.0)
-        super().__init__(
-            self.recorder, frame, policies=StreamOptions(**policies), time_unit=time_unit
-        )
+        info = StreamInfo(NAMES, ("m",) * 3, Scaler.identity(3), median_gap=0.1, elapsed_limit=2.0)
+        super().__init__(self.recorder, info, options=StreamOptions(**options), time_unit=time_unit)
 
     @property
     def rows(self) -> list[tuple[float, tuple[float | None, ...]]]:

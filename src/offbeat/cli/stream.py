@@ -10,7 +10,7 @@ from offbeat.stream.options import StreamOptions
 
 def stream_command(
     model: Path,
-    policies: StreamOptions = StreamOptions(),  # noqa: B008  # frozen
+    options: StreamOptions = StreamOptions(),  # noqa: B008  # frozen
     horizon_s: float | None = None,
     time_unit: str = "s",
     state: Path | None = None,
@@ -19,7 +19,7 @@ def stream_command(
 ) -> None:
     """Run a model live: JSON lines on standard input, an answer to each on standard output.
 
-    {"t": 0.25, "values": {"knee": 0.3}} is answered with what became of it and with a prediction.
+    {"t": 0.25, "values": {"knee": 0.3}} is answered with its outcome and with a prediction.
     Channels that are null or left out were not measured. {"predict": 0.3} predicts and consumes
     nothing; {"reset": true}, {"counters": true}, {"state": true} and {"restore": STATE} do what
     they say. A bad line is answered with {"error": ...}. It ends with the input or on SIGTERM,
@@ -27,7 +27,7 @@ def stream_command(
 
     Args:
         model: folder of a run or of a checkpoint, or a file that `offbeat export` wrote.
-        policies: what to do with messages that are late, repeated, stale or on another clock.
+        options: what to do with messages that are late, repeated, stale or on another clock.
         horizon_s: predict so many seconds after the newest row; by default each row is predicted
             at its own time, before its values are looked at.
         time_unit: of all times: s, ms, us or ns. Integers are exact.
@@ -54,7 +54,7 @@ def stream_command(
     if model.suffix == ".onnx":
         from offbeat.export.runner import OnnxStream
 
-        stream = OnnxStream(model, policies, time_unit=time_unit)
+        stream = OnnxStream(model, options, time_unit=time_unit)
     else:
         import torch
 
@@ -62,7 +62,7 @@ def stream_command(
         from offbeat.stream.stream import Stream
 
         torch.set_num_threads(1)
-        stream = Stream(load_model(model), policies, time_unit=time_unit, seed=seed)
+        stream = Stream(load_model(model), options, time_unit=time_unit, seed=seed)
     if state is not None and state.exists():
         try:
             stream.restore(json.loads(state.read_text(encoding="utf-8")))
@@ -91,6 +91,6 @@ def stream_command(
             "bad_lines": session.bad_lines,
             "answers_heard_to_the_end": heard,
             "latency": latency.to_dict(),
-            "counters": stream.counters.to_dict() | {"held": stream.held},
+            "counters": stream.counters.to_dict() | {"pending": stream.pending},
         }
         print(json.dumps(counted, indent=2), file=sys.stderr)

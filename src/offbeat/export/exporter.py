@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError, one_of, require
 from offbeat.export.runner import FORMAT, METADATA, STATE, VERSION
 from offbeat.export.step import StreamStep, most_steps
@@ -101,6 +102,7 @@ def _facts(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
         "units": list(model.units),
         "median_gap_s": model.statistics.median_gap,
         "elapsed_limit_s": model.statistics.longest_elapsed * limit,
+        "transforms": transforms_of(model).to_dict(),
         "dtype": str(model.dtype).removeprefix("torch."),
         "initial": finite,
     }

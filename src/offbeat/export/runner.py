@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.scaler import Scaler
+from offbeat.data.transforms import Transforms
 from offbeat.errors import FileFormatError, require
 from offbeat.stream.engine import Arrays, Engine
-from offbeat.stream.live import Frame, LiveStream
+from offbeat.stream.live import LiveStream, StreamInfo
 from offbeat.stream.options import StreamOptions, with_options
 
 FORMAT = "offbeat-step"
-VERSION = 1
+VERSION = 2
 METADATA = "offbeat"
 """Key in the metadata of the file, where a JSON object stands."""
 
@@ -32,29 +33,29 @@ class OnnxStream(LiveStream):
 
     Args:
         path: the .onnx file.
-        policies: what to do with messages out of order.
+        options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns. Integers are exact.
-        **options: fields of `StreamOptions` that replace those of `policies`.
+        **fields: fields of `StreamOptions` that replace those of `options`.
 
     Raises:
         FileFormatError: the file is missing, damaged, or not written by `export_onnx`.
-        InputError: an unknown unit or option, or a policy out of its range.
+        InputError: an unknown unit or option, or an option out of its range.
         MissingExtraError: onnxruntime is not installed.
     """
 
     def __init__(
         self,
         path: str | Path,
-        policies: StreamOptions | None = None,
+        options: StreamOptions | None = None,
         *,
         time_unit: str = "s",
-        **options: Any,
+        **fields: Any,
     ) -> None:
         engine = OnnxEngine(path)
         super().__init__(
             engine,
-            engine.frame,
-            policies=with_options(policies, options),
+            engine.info,
+            options=with_options(options, fields),
             time_unit=time_unit,
         )
 
@@ -83,7 +84,7 @@ class OnnxEngine(Engine):
         try:
             session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
             facts = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
-            self.frame, self._initial = _read(facts)
+            self.info, self._initial = _read(facts)
         except FileFormatError:
             raise
         except Exception as error:  # onnxruntime has an exception of its own for every fault
@@ -92,7 +93,7 @@ class OnnxEngine(Engine):
                 f"{path} is not a model that offbeat export wrote, or damaged ({what})"
             ) from None
         self._session, self._digest = session, hashlib.sha256(data).hexdigest()
-        self._unmeasured = np.full((1, len(self.frame.names)), np.nan)
+        self._unmeasured = np.full((1, len(self.info.names)), np.nan)
         self._next = [f"{name}_next" for name in STATE]
         self._slots: list[Arrays] = []
         self.reset()
@@ -143,8 +144,8 @@ class OnnxEngine(Engine):
         return self._digest
 
 
-def _read(facts: Any) -> tuple[Frame, Arrays]:
-    """What the metadata says: the frame of the stream, and the state before anything was seen."""
+def _read(facts: Any) -> tuple[StreamInfo, Arrays]:
+    """What the metadata says: the info of the stream, and the state before anything is observed."""
     if facts["format"] != FORMAT or facts["version"] != VERSION:
         raise FileFormatError(
             f"the ONNX file is a {facts['format']!r} of version {facts['version']!r}, this Offbeat "
@@ -159,11 +160,12 @@ def _read(facts: Any) -> tuple[Frame, Arrays]:
     for name, value in _BEGINS.items():
         initial[name] = np.full(shapes.get(name, (1,)), value)
     initial["updated"] = np.zeros(1, dtype=bool)
-    frame = Frame(
+    info = StreamInfo(
         names=names,
         units=tuple(facts["units"]),
         scaler=Scaler.identity(len(names)),
         median_gap=float(facts["median_gap_s"]),
         elapsed_limit=float(facts["elapsed_limit_s"]),
+        transforms=Transforms.from_dict(facts["transforms"]),
     )
-    return frame, {name: initial[name] for name in STATE}
+    return info, {name: initial[name] for name in STATE}

@@ -1,4 +1,4 @@
-"""Runs a model row by row in compiled code, in buffers that are made once."""
+"""Runs a model row by row in compiled code, in buffers that are allocated once."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class CpuEngine(Engine):
         self._model, self._seed = model, seed
         config, spec = model.config, model.spec
         self._dtype = np.dtype(str(model.dtype).removeprefix("torch."))
-        self._share = float(config.self_feeding or 0.0)
+        self._fraction = float(config.self_feeding or 0.0)
         limit, statistics = float(config.gap_limit or 1), model.statistics
         decoder, decoder_weights = [], None
         if model.decoder is not None:
@@ -57,9 +57,18 @@ class CpuEngine(Engine):
                 starts_only=config.cell == "none",
                 exponential=bool(spec.decay) and not isinstance(model.decay, TrainableDecay),
             )
-        self._coins: torch.Generator | None = None
+        self._generator: torch.Generator | None = None
         self._kept: list[torch.Tensor | None] = []
         self.reset()
+
+    @staticmethod
+    def unsupported(model: Model) -> str | None:
+        """Why this engine cannot run a model; None where it can.
+
+        Args:
+            model: any.
+        """
+        return None if model.runs_compiled() else "its scan does not run in compiled code here"
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -72,15 +81,15 @@ class CpuEngine(Engine):
         self._kept = [None] * slots
 
     def reset(self) -> None:
-        """Begins anew, with the first coin."""
+        """Begins anew, with the first random number."""
         self._live.reset()
-        self._coins = torch.Generator().manual_seed(self._seed) if self._share else None
+        self._generator = torch.Generator().manual_seed(self._seed) if self._fraction else None
 
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
         """Consumes one row."""
         fed = False
-        if self._coins is not None:
-            fed = float(torch.rand((), generator=self._coins)) < self._share
+        if self._generator is not None:
+            fed = float(torch.rand((), generator=self._generator)) < self._fraction
             fed = fed and self._live.rows > 0
         self._live.observe(time, values, mask, fed)
 
@@ -93,17 +102,17 @@ class CpuEngine(Engine):
     def save(self, slot: int) -> None:
         """Copies the state to a slot."""
         self._live.save(slot)
-        self._kept[slot] = None if self._coins is None else self._coins.get_state()
+        self._kept[slot] = None if self._generator is None else self._generator.get_state()
 
     def load(self, slot: int) -> None:
         """Copies a slot to the state."""
         self._live.load(slot)
         kept = self._kept[slot]
-        if self._coins is not None and kept is not None:
-            self._coins.set_state(kept)
+        if self._generator is not None and kept is not None:
+            self._generator.set_state(kept)
 
     def export(self) -> Arrays:
-        """The parts of the carry, named as those of `TorchEngine`."""
+        """The parts of the recurrent state, named as those of `TorchEngine`."""
         flat = np.empty(self._live.size)
         self._live.export_to(flat)
         arrays: Arrays = {}
@@ -112,19 +121,19 @@ class CpuEngine(Engine):
             n = int(np.prod(shape))
             arrays[name] = flat[at : at + n].reshape(shape).astype(kind)
             at += n
-        if self._coins is not None:
-            arrays["generator"] = self._coins.get_state().numpy().copy()
+        if self._generator is not None:
+            arrays["generator"] = self._generator.get_state().numpy().copy()
         return arrays
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes the parts of a carry."""
+        """Takes the parts of a recurrent state."""
         parts = [arrays[name].astype(np.float64).reshape(-1) for name, _, _ in self._parts()]
         self._live.restore(np.concatenate(parts))
-        if self._coins is not None:
-            self._coins.set_state(torch.tensor(arrays["generator"]))
+        if self._generator is not None:
+            self._generator.set_state(torch.tensor(arrays["generator"]))
 
     def fingerprint(self) -> str:
-        """As `TorchEngine` says: a state of the one can be restored in the other."""
+        """That of `TorchEngine`: a state of the one can be restored in the other."""
         return TorchEngine(self._model).fingerprint()
 
     def _parts(self) -> list[tuple[str, tuple[int, ...], Any]]:

@@ -1,4 +1,4 @@
-"""What a stream needs of whatever runs the model: one row at a time, and states to go back to."""
+"""What a stream needs of whatever runs the model: one row at a time, and saved states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class Engine(ABC):
-    """Runs a model row by row: holds the state now, and copies of earlier ones in slots.
+    """Runs a model row by row: has the current state, and copies of earlier ones in slots.
 
     A method that raises leaves the state as it was.
     """
@@ -34,7 +34,7 @@ class Engine(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Begins anew: nothing seen yet."""
+        """Begins anew: nothing observed yet."""
 
     @abstractmethod
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
@@ -42,19 +42,19 @@ class Engine(ABC):
 
         Args:
             time: s, later than the row before; any origin that stays the same until a reset.
-            values: (channels,) of `dtype`, scaled; 0 where not measured.
+            values: (channels,) of `dtype`; 0 where not measured.
             mask: (channels,) True where measured.
         """
 
     @abstractmethod
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predicts a next row, should it come at each of these times; consumes nothing.
+        """Predicts the next row, should it come at each of these times; the state stays as it is.
 
         Args:
             times: (times,) s, none before the newest row.
 
         Returns:
-            (times, channels) scaled.
+            (times, channels) in the units of the engine.
         """
 
     @abstractmethod
@@ -75,11 +75,11 @@ class Engine(ABC):
 
     @abstractmethod
     def fingerprint(self) -> str:
-        """Tells one model from another: a state belongs to the model that made it."""
+        """Differs between models: a state belongs to the model that made it."""
 
 
 def encode(array: NDArray[Any]) -> dict[str, Any]:
-    """An array as JSON knows it: to the last bit, NaN and infinities included."""
+    """An array in JSON-like form: to the last bit, NaN and infinities included."""
     array = np.ascontiguousarray(array)
     array = array.astype(array.dtype.newbyteorder("<"), copy=False)
     data = base64.b64encode(array.tobytes()).decode("ascii")
@@ -111,7 +111,7 @@ def decode(record: Any, like: NDArray[Any], what: str) -> NDArray[Any]:
 
 
 def encode_all(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """A state as JSON knows it."""
+    """A state in JSON-like form."""
     return {name: encode(array) for name, array in arrays.items()}
 
 

@@ -1,4 +1,4 @@
-"""The newest rows of a stream, each with the state before it: what a late message is put among."""
+"""The newest rows of a stream, each with the state before it, so that late rows can be inserted."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Row(NamedTuple):
 
 
 class History:
-    """Feeds rows to an engine, and takes it back to before any of the newest of them.
+    """Feeds rows to an engine, and returns it to its state before any of the newest rows.
 
     Args:
         engine: runs the model.
-        kept: so many rows are kept.
+        kept: number of newest rows that are kept.
     """
 
     def __init__(self, engine: Engine, kept: int) -> None:
@@ -45,7 +45,7 @@ class History:
         self.forget()
 
     def forget(self) -> None:
-        """Keeps no row; the engine stays as it is."""
+        """Drops all rows; the engine stays as it is."""
         self.rows: list[Row] = []
         self._free = list(range(self._undo))
         self.floor = -math.inf
@@ -88,7 +88,7 @@ class History:
         return None if i == 0 and time - within <= self.floor else (i, False)
 
     def record(self) -> dict[str, Any]:
-        """The rows and all states, as JSON knows them."""
+        """The rows and all states, JSON-like."""
         rows = []
         self._engine.save(self._undo)
         now = self._engine.export()
@@ -158,10 +158,10 @@ class History:
 
 
 def seconds(value: Any) -> float:
-    """A finite number out of a record.
+    """A finite number from a record.
 
     Raises:
-        InputError: it is none.
+        InputError: it is not one.
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not math.isfinite(value):

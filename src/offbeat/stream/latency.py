@@ -1,4 +1,4 @@
-"""How long things took, in fixed memory however many they are."""
+"""A histogram of durations, in fixed memory."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class Latency:
         place = math.ceil(BINS_PER_DECADE * math.log10(us / FIRST_US)) if us > FIRST_US else 0
         self._bins[min(place, len(self._bins) - 1)] += 1
 
-    def quantile_us(self, share: float) -> float | None:
-        """An upper bound, at most 4.8 % above the duration that this share does not exceed.
+    def quantile_us(self, fraction: float) -> float | None:
+        """An upper bound, at most 4.8 % above the duration that this fraction does not exceed.
 
         None while nothing was counted. Above 10 s it is the longest duration.
         """
         if not self.count:
             return None
-        wanted, below = max(1, math.ceil(share * self.count)), 0
+        wanted, below = max(1, math.ceil(fraction * self.count)), 0
         for place, count in enumerate(self._bins[:-1]):
             below += count
             if below >= wanted:

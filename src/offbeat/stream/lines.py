@@ -1,4 +1,4 @@
-"""A stream that is spoken to in JSON lines: every line is answered by one line, in order."""
+"""A stream driven by JSON lines: every line is answered by one line, in order."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from offbeat.stream.live import LiveStream
 
 
 class LineSession:
-    """Answers lines with lines.
+    """Answers JSON lines.
 
         {"t": T, "values": {"CHANNEL": V, ...}}   V null, NaN or left out: not measured
         {"t": T, "values": [V, ...], "now": N}    in the order of the model; now is optional
         {"predict": T}  {"predict": [T, ...]}     consumes nothing
         {"reset": true}  {"counters": true}  {"state": true}  {"restore": STATE}
 
-    An observation is answered with what became of it and, where it is a new row, with the
-    prediction that was made for it before its values were looked at: one step ahead. With a
-    horizon, it is answered with the prediction so many seconds after the newest row.
+    An observation is answered with what was done with it and, where it is a new row, with the
+    prediction that was made for it before its values were used: one step ahead. With a horizon, it
+    is answered with the prediction so many seconds after the newest row.
 
     Args:
-        stream: is spoken to.
+        stream: takes the observations.
         horizon_s: s from the newest row to the time predicted at; None predicts each new row.
     """
 
@@ -36,19 +36,18 @@ class LineSession:
         self.lines = self.bad_lines = 0
 
     def answer(self, line: bytes) -> bytes:
-        """The answer to a line, with its newline; nothing to a blank one. Never raises on input."""
+        """The answer to a line, with its newline; empty for a blank one. Never raises on input."""
         self.lines += 1
         if not line.strip():
             return b""
         try:
-            said = self._answer(line)
-            text = json.dumps(said, allow_nan=False)
+            text = json.dumps(self._answer(line), allow_nan=False)
         except (OffbeatError, ValueError, RecursionError) as error:
             return self._refusal(str(error) or type(error).__name__)
         return text.encode() + b"\n"
 
     def refuse(self, why: str) -> bytes:
-        """The answer to a line that was not even read."""
+        """The answer to a line that was not read."""
         self.lines += 1
         return self._refusal(why)
 
@@ -61,7 +60,7 @@ class LineSession:
         try:
             message = json.loads(line.decode("utf-8"))
         except ValueError as error:
-            raise InputError(f"this is no JSON ({error}); every line is one object") from None
+            raise InputError(f"not JSON ({error}); every line is one object") from None
         if not isinstance(message, dict):
             raise InputError(f"a line must be a JSON object, got {type(message).__name__}")
         keys = message.keys()
@@ -79,7 +78,7 @@ class LineSession:
                 raise InputError(f"{key!r} must be true, got {message[key]!r}")
             return self._command(key)
         raise InputError(
-            f"a line with the keys {', '.join(sorted(keys)) or 'none'} says nothing to a stream; "
+            f"a line with the keys {', '.join(sorted(keys)) or 'none'} is not known; "
             "expected 't' and 'values' (and 'now'), or one of 'predict', 'reset', 'counters', "
             "'state', 'restore'"
         )
@@ -98,7 +97,7 @@ class LineSession:
         if key == "state":
             return {"state": self.stream.state()}
         if key == "counters":
-            return {"counters": self.stream.counters.to_dict() | {"held": self.stream.held}}
+            return {"counters": self.stream.counters.to_dict() | {"pending": self.stream.pending}}
         self.stream.reset()
         return {"reset": True}
 

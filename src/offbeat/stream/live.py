@@ -1,4 +1,4 @@
-"""The stream itself, whatever runs the model: rows in the order of time out of messages in any."""
+"""A stream of messages in any order, whatever runs the model."""
 
 from __future__ import annotations
 
@@ -10,26 +10,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat.data.scaler import Scaler
+from offbeat.data.transforms import Transforms
 from offbeat.errors import DivergenceError, InputError
 from offbeat.stream.engine import Engine
 from offbeat.stream.messages import RowReader, Time, Values
 from offbeat.stream.options import Outcome, StreamCounters, StreamOptions
 from offbeat.stream.placing import Placement
+from offbeat.stream.transformed import TransformedEngine
 
 FORMAT = "offbeat-stream"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What a stream must know of its model.
+class StreamInfo:
+    """What a stream needs to know of its model.
 
     Attributes:
         names: of the channels.
         units: of the channels.
         scaler: maps original units to those of the engine.
-        median_gap: s, between the rows of the training part.
+        median_gap: s, between the rows of the training set.
         elapsed_limit: s without an observation, at which the model's time saturates.
+        transforms: of the model.
     """
 
     names: tuple[str, ...]
@@ -37,33 +40,38 @@ class Frame:
     scaler: Scaler
     median_gap: float
     elapsed_limit: float
+    transforms: Transforms = Transforms()  # noqa: RUF009  # frozen
 
 
 class LiveStream:
     """Feeds messages to an engine, one row at a time; `Stream` and `OnnxStream` are public.
 
-    Memory does not grow. One thread at a time: calls must not overlap.
+    Memory does not grow. Not thread-safe: calls must not overlap.
 
     Args:
         engine: runs the model.
-        frame: what must be known of it.
-        policies: what to do with messages out of order.
+        info: about the model.
+        options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns.
     """
 
     def __init__(
-        self, engine: Engine, frame: Frame, *, policies: StreamOptions, time_unit: str
+        self, engine: Engine, info: StreamInfo, *, options: StreamOptions, time_unit: str
     ) -> None:
-        self.names, self.units, self.policies = frame.names, frame.units, policies
-        self._engine, self._frame = engine, frame
-        self._reader = RowReader(frame.names, frame.scaler, engine.dtype)
+        self.names, self.units, self.options = info.names, info.units, options
+        transformed = not info.transforms.is_identity
+        self._reader = RowReader(info.names, info.scaler, engine.dtype, scale=not transformed)
+        self._scaler = Scaler.identity(len(info.names)) if transformed else info.scaler
+        if transformed:
+            engine = TransformedEngine(engine, info.transforms, info.names, info.scaler)
+        self._engine = engine
         self._placing = Placement(
             engine,
-            policies,
-            names=frame.names,
+            options,
+            names=info.names,
             time_unit=time_unit,
-            median_gap=frame.median_gap,
-            elapsed_limit=frame.elapsed_limit,
+            median_gap=info.median_gap,
+            elapsed_limit=info.elapsed_limit,
         )
         self._clock, self._history = self._placing.clock, self._placing.history
 
@@ -84,36 +92,36 @@ class LiveStream:
 
     @property
     def counters(self) -> StreamCounters:
-        """A copy of the counts so far."""
+        """A copy of the counters."""
         return replace(self._placing.counters)
 
     @property
-    def held(self) -> int:
-        """Messages kept aside until it is clear whether the clock has jumped."""
-        return len(self._placing.held)
+    def pending(self) -> int:
+        """Messages that wait until it is clear whether the clock has jumped."""
+        return len(self._placing.pending)
 
     def observe(self, t: Time, values: Values, *, now: Time | None = None) -> Outcome:
         """Takes what was measured at a time.
 
         Args:
-            t: when, in the unit of the stream; an integer is exact.
+            t: in the unit of the stream; an integer is exact.
             values: channel to value, or one value per channel, in original units. NaN, None and
                 channels that are left out were not measured.
             now: what the clock says on arrival, for `stale_after_s`.
 
         Returns:
-            What became of the message.
+            What was done with the message.
 
         Raises:
-            InputError: a time that is no finite number, an unknown channel, a value that is no
-                number, or what the policies call an error. The message has changed nothing then.
-            DivergenceError: an adaptive solver could not keep its tolerance. The message has
-                changed nothing then.
+            InputError: a time that is not a finite number, an unknown channel, a value that is not
+                a number, or what the options call an error. The stream has not changed then.
+            DivergenceError: an adaptive solver could not reach its tolerance. The stream has not
+                changed then.
         """
         t = self._clock.read(t)
         row, mask, measured, not_finite = self._reader.read(values)
         waited = -math.inf if now is None else self._clock.between(self._clock.read(now), t)
-        if waited > (self.policies.stale_after_s or math.inf):
+        if waited > (self.options.stale_after_s or math.inf):
             outcome = self._placing.drop("stale")
         else:
             outcome = self._placing.take(t, row, mask, measured)
@@ -130,12 +138,12 @@ class LiveStream:
 
         Args:
             t: as in `observe`.
-            values: as in `observe`; the prediction is made before they are looked at.
+            values: as in `observe`; the prediction does not depend on them.
             now: as in `observe`.
 
         Returns:
-            What became of the message; and where it is a `new` row, (channels,) predicted for it
-            in original units, one step ahead.
+            What was done with the message; and where it is a `new` row, (channels,) predicted for
+            it in original units, one step ahead.
 
         Raises:
             InputError: as `observe`.
@@ -154,21 +162,21 @@ class LiveStream:
         return outcome, predicted[-1] if outcome == "new" else None
 
     def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
-        """Predicts the channels at a time, from all that was observed; consumes nothing.
+        """Predicts the channels at a time, from all that was observed; the state stays as it is.
 
-        It is what the batch pass says of a row at this time, should it come next. At the time of
-        the newest row itself, that row's values are known already. Several times are several
-        questions: none of them changes the answer to another.
+        It is the prediction of the batch pass for a row at this time, should it be the next one.
+        At the time of the newest row, the values of that row are known already. Several times are
+        independent: each is predicted as if it were the only one.
 
         Args:
-            t: when, in the unit of the stream, not before the newest row; or an array of times.
+            t: in the unit of the stream, not before the newest row; or an array of times.
 
         Returns:
             (channels,) in original units, or (times, channels).
 
         Raises:
-            InputError: a time that is no finite number, or lies before the newest row.
-            DivergenceError: the state has left the finite numbers; `reset` the stream.
+            InputError: a time that is not a finite number, or is before the newest row.
+            DivergenceError: the state is no longer finite; `reset` the stream.
         """
         if isinstance(t, np.ndarray) and t.ndim == 0:
             t = t[()]
@@ -180,11 +188,11 @@ class LiveStream:
         return predicted if several else predicted[0]
 
     def reset(self) -> None:
-        """Begins anew: nothing seen yet. The counters go on."""
+        """Begins anew: nothing observed yet. The counters go on."""
         self._placing.begin_anew()
 
     def state(self) -> dict[str, Any]:
-        """All that the stream is, as JSON knows it; `restore` goes on from it bit for bit."""
+        """All of the stream as JSON-like record; `restore` continues from it bit for bit."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -194,11 +202,11 @@ class LiveStream:
         }
 
     def restore(self, record: dict[str, Any]) -> None:
-        """Takes up what `state` recorded. The policies stay this stream's own.
+        """Continues from what `state` recorded. The options stay those of this stream.
 
         Raises:
-            InputError: the record is damaged, or of another model or time unit. Nothing has changed
-                then.
+            InputError: the record is damaged, or of another model or time unit. The stream has not
+                changed then.
         """
         if not isinstance(record, dict) or record.get("format") != FORMAT:
             raise InputError(f"this is no record of a stream (it has no format {FORMAT!r})")
@@ -214,20 +222,20 @@ class LiveStream:
 
     def _predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """(times, channels) in original units."""
-        scaled = self._engine.predict(times)
-        if not np.isfinite(scaled).all():
-            raise DivergenceError("the state has left the finite numbers; reset the stream")
+        predicted = self._engine.predict(times)
+        if not np.isfinite(predicted).all():
+            raise DivergenceError("the state is no longer finite; reset the stream")
         self._placing.counters.predictions += len(times)
-        return self._frame.scaler.original(scaled)
+        return self._scaler.original(predicted)
 
     def _asked(self, t: Time) -> float:
-        """A time that was asked for, in s."""
+        """A time to predict at, in s."""
         if not self._history.rows:
             return 0.0
         time, newest = self._clock.seconds(t), self._history.newest
-        if newest - time > self.policies.merge_within_s:
+        if newest - time > self.options.merge_within_s:
             raise InputError(
                 f"asked for the time {t}, {newest - time:g} s before the newest row, of the time "
-                f"{self.time}; a stream answers for the time of its newest row and later"
+                f"{self.time}; a stream predicts at the time of its newest row and later"
             )
         return max(time, newest)

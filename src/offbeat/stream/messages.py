@@ -1,4 +1,4 @@
-"""From what a message says to what a model takes: times to seconds, values to scaled rows."""
+"""From messages to the input of a model: times to seconds, values to scaled rows."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from offbeat.data.trajectory import SECONDS_PER
 from offbeat.errors import InputError, one_of
 
 Time = int | float
-"""In the unit of a stream; integers are exact, however long ago their clock began."""
+"""In the unit of a stream; integers are exact, whatever the origin of their clock."""
 
 Values = Mapping[str, float | None] | ArrayLike
-"""Channel to value, or one value per channel; NaN, None and what is left out are not measured."""
+"""Channel to value, or one value per channel; NaN, None and what is left out was not measured."""
 
 _EXACT = 2.0**53
-"""Floats are further apart than 1 from here on."""
+"""From here on floats are further apart than 1."""
 
 
 class Clock:
@@ -46,7 +46,7 @@ class Clock:
         """A time as a plain number.
 
         Raises:
-            InputError: it is no finite number, or a float too large to be exact.
+            InputError: it is not a finite number, or a float too large to be exact.
         """
         if type(t) is not float:
             if isinstance(t, bool | np.bool_):
@@ -70,14 +70,14 @@ class Clock:
         """Since the origin; 0 while there is none.
 
         Raises:
-            InputError: too far away to be told in seconds.
+            InputError: too far away to be given in seconds.
         """
         if self.origin is None:
             return 0.0
         try:
             return (t - self.origin) / self.ticks
         except OverflowError:
-            raise InputError(f"the time {t} lies beyond all numbers of seconds") from None
+            raise InputError(f"the time {t} is too far away to be given in seconds") from None
 
     def at(self, seconds: float) -> Time:
         """The inverse of `seconds`, to the nearest tick where the origin is an integer."""
@@ -86,14 +86,14 @@ class Clock:
         return origin + (round(ticks) if isinstance(origin, int) and self.ticks > 1 else ticks)
 
     def between(self, later: Time, earlier: Time) -> float:
-        """Seconds from one time to another; infinite where no float can tell."""
+        """Seconds from one time to another; infinite beyond the range of floats."""
         try:
             return (later - earlier) / self.ticks
         except OverflowError:
             return math.inf if later > earlier else -math.inf
 
     def rebase(self, t: Time, seconds: float) -> None:
-        """Moves the origin, so that `t` lies so many seconds after it."""
+        """Moves the origin, so that `t` is so many seconds after it."""
         ticks = seconds * self.ticks
         exact = isinstance(t, int) and self.ticks > 1
         self.origin = t - (round(ticks) if exact else ticks)
@@ -106,12 +106,15 @@ class RowReader:
         names: of the channels, in the order of the model.
         scaler: maps original units to scaled ones.
         dtype: of the scaled row.
+        scale: whether rows are scaled; else they stay in original units, as float64.
     """
 
-    def __init__(self, names: Sequence[str], scaler: Scaler, dtype: np.dtype[Any]) -> None:
+    def __init__(
+        self, names: Sequence[str], scaler: Scaler, dtype: np.dtype[Any], *, scale: bool = True
+    ) -> None:
         self.names = tuple(names)
         self._index = {name: i for i, name in enumerate(self.names)}
-        self._scaler, self._dtype = scaler, dtype
+        self._scaler, self._dtype, self._scale = scaler, dtype, scale
         # Values between these stay finite when scaled; no comparison with NaN is true.
         largest = np.finfo(np.float64).max / 4
         with np.errstate(over="ignore"):
@@ -119,20 +122,22 @@ class RowReader:
         self._low, self._high = scaler.shift - reach, scaler.shift + reach
 
     def read(self, values: Values) -> tuple[NDArray[Any], NDArray[np.bool_], int, int]:
-        """Scaled values (0 where not measured), their mask, and two counts.
+        """A row (0 where not measured), its mask, and two counts.
 
-        The counts are of what was measured, and of what was not finite, or too large once scaled,
-        and counts as not measured.
+        The counts are of values that were measured, and of values that were not finite, or too
+        large when scaled, and count as not measured.
 
         Raises:
-            InputError: unknown channels, another number of them, or something that is no number.
+            InputError: unknown channels, another number of them, or something that is not a number.
         """
         raw = self._named(values) if isinstance(values, Mapping) else self._all(values)
         mask = (raw >= self._low) & (raw <= self._high)
         measured, not_finite = int(np.count_nonzero(mask)), 0
         if measured < len(mask):
             not_finite = len(mask) - measured - int(np.count_nonzero(np.isnan(raw)))
-            raw = np.where(mask, raw, self._scaler.shift)
+            raw = np.where(mask, raw, self._scaler.shift if self._scale else 0.0)
+        if not self._scale:
+            return raw, mask, measured, not_finite
         return self._scaler.scaled(raw).astype(self._dtype), mask, measured, not_finite
 
     def _named(self, values: Mapping[str, Any]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What a stream does with messages that do not come in order, and how often it had to."""
+"""What a stream does with messages out of order, and how often it did."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, Literal
 from offbeat.errors import InputError, one_of
 
 Outcome = Literal[
-    "new", "merged", "duplicate", "reordered", "late", "stale", "ahead", "held", "jumped"
+    "new", "merged", "duplicate", "reordered", "late", "stale", "ahead", "pending", "jumped"
 ]
-"""What became of a message.
+"""What was done with a message.
 
-`new`: a row of its own. `merged`: joined the row of the same time. `duplicate`: told nothing new.
-`reordered`: came late and was put in its place. `late`, `stale`, `ahead`: dropped. `held`: kept
-aside until it is clear whether the clock has jumped. `jumped`: the clock has.
+`new`: a row of its own. `merged`: joined the row of the same time. `duplicate`: held nothing new.
+`reordered`: came late and was put in its place. `late`, `stale`, `ahead`: dropped. `pending`: waits
+until it is clear whether the clock has jumped. `jumped`: the clock has.
 """
 
 
@@ -24,36 +24,40 @@ class StreamOptions:
     """What to do with messages that are not simply the next row.
 
     With the defaults a stream of increasing times is the batch pass over the same rows, whatever
-    its gaps, and no single wrong stamp can end it.
+    its gaps, and no single wrong time stamp can end it.
 
     Attributes:
         merge_within_s: s; messages whose times differ by no more than this are one row, at the time
-            of the first of them. At 0, equal times alone. The model is taken back to before that
-            row and sees it whole: the same as if all had come at once.
-        duplicates: a value for a channel that the row of this time already has: the `first` one
-            stands, the `last` one does, or `error`.
+            of the first of them. At 0, equal times alone. The model goes back to before that row
+            and sees it whole: the same as if all had come at once.
+        duplicates: a value for a channel that the row of this time already has: keep the `last`
+            one, as `read` does, the `first` one, or `error`.
         late: a message older than the newest row, by no more than `jump_back_s`: `drop` it;
             `reorder`, put it in its place and run the rows after it again; or `error`.
         reorder_rows: rows that are kept for `reorder`; what is older than these is dropped.
         stale_after_s: s; what is older than this on arrival is dropped, whatever `late` says:
             behind the `now` that `observe` is given, or else behind the newest row. None: never.
         jump: when the clock has jumped, `reset`, begin anew at the new time; `continue`, keep the
-            state and take the jump for one median gap; `drop`, nothing but the old clock counts,
-            and what is far behind it is late; or `error`.
+            state and take the jump for one median gap; `drop`, only the old clock counts, and what
+            is far behind it is late; or `error`.
         jump_back_s: s; a message older than the newest row by more than this may mean a clock that
             was set back (a simulation started again, a log played again).
         jump_ahead_s: s; a message newer than the newest row by more than this may mean a clock that
-            was set ahead, or a wrong stamp. None: it is a gap, of whatever length.
-        confirm: a clock has jumped when so many messages in a row say the same; until then they
-            are held, and one message on the old clock makes them late ones. Nothing held is lost:
-            after the jump they are consumed.
+            was set ahead, or a wrong time stamp. None: it is a gap, of whatever length.
+        confirm: a clock has jumped when so many messages in a row agree; until then they are
+            pending, and one message on the old clock makes them late ones. Nothing pending is
+            lost: after the jump they are consumed.
         long_gap: after more than `long_gap_s` without a value, `saturate`, let the model's own
             limit act, or `reset`, begin anew.
         long_gap_s: s; None is the model's own limit, where time saturates.
+        window_rows: newest rows that a model without a recurrent state is run on.
+
+    Raises:
+        InputError: a value is none of these.
     """
 
     merge_within_s: float = 0.0
-    duplicates: Literal["first", "last", "error"] = "first"
+    duplicates: Literal["first", "last", "error"] = "last"
     late: Literal["drop", "reorder", "error"] = "drop"
     reorder_rows: int = 32
     stale_after_s: float | None = None
@@ -63,13 +67,14 @@ class StreamOptions:
     confirm: int = 5
     long_gap: Literal["saturate", "reset"] = "saturate"
     long_gap_s: float | None = None
+    window_rows: int = 100
 
     def __post_init__(self) -> None:
-        one_of("policy of duplicates", self.duplicates, ("first", "last", "error"))
-        one_of("policy of late", self.late, ("drop", "reorder", "error"))
-        one_of("policy of jump", self.jump, ("reset", "continue", "drop", "error"))
-        one_of("policy of long_gap", self.long_gap, ("saturate", "reset"))
-        for name in ("reorder_rows", "confirm"):
+        one_of("duplicates", self.duplicates, ("first", "last", "error"))
+        one_of("late", self.late, ("drop", "reorder", "error"))
+        one_of("jump", self.jump, ("reset", "continue", "drop", "error"))
+        one_of("long_gap", self.long_gap, ("saturate", "reset"))
+        for name in ("reorder_rows", "confirm", "window_rows"):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise InputError(f"{name} must be an integer of at least 1, got {value!r}")
@@ -97,16 +102,16 @@ class StreamOptions:
 
 @dataclass
 class StreamCounters:
-    """How many of what a stream has met. A reset leaves them.
+    """How many of each a stream has met. A reset leaves them.
 
     Attributes:
         messages: given to `observe`, errors left out.
-        rows: that the model has seen, reordered ones included.
+        rows: consumed by the model, reordered ones included.
         merged: messages that joined the row of the same time.
         duplicates: messages with a value that the row of the same time already had.
         reordered: late messages that were put in their place.
         late: late messages that were dropped.
-        stale: messages that were dropped for their age.
+        stale: messages that were dropped because they were too old.
         ahead: messages that were dropped for being far ahead.
         empty: messages in which nothing was measured.
         not_finite: values that were infinite, or too large for the model's numbers; they count as
@@ -137,7 +142,7 @@ class StreamCounters:
     predictions: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """By name, as JSON knows them."""
+        """JSON-like form."""
         return asdict(self)
 
     @classmethod
@@ -145,7 +150,7 @@ class StreamCounters:
         """The inverse of `to_dict`.
 
         Raises:
-            InputError: a counter is missing, unknown or no number.
+            InputError: a counter is missing, unknown or not a number.
         """
         names = {f.name for f in fields(cls)}
         if not isinstance(value, dict) or value.keys() != names:
@@ -155,19 +160,19 @@ class StreamCounters:
         return cls(**value)
 
 
-def with_options(policies: StreamOptions | None, options: dict[str, Any]) -> StreamOptions:
-    """The policies with some fields replaced.
+def with_options(options: StreamOptions | None, changes: dict[str, Any]) -> StreamOptions:
+    """Options with some fields replaced.
 
     Args:
-        policies: None stands for the defaults.
-        options: fields of `StreamOptions`.
+        options: None stands for the defaults.
+        changes: fields of `StreamOptions`.
 
     Raises:
         InputError: an unknown field, or a value out of its range.
     """
-    for key in options:
-        one_of("policy of streams", key, [f.name for f in fields(StreamOptions)])
-    return replace(policies or StreamOptions(), **options)
+    for key in changes:
+        one_of("stream option", key, [f.name for f in fields(StreamOptions)])
+    return replace(options or StreamOptions(), **changes)
 
 
 def _is_number(value: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Lines in, lines out, until the input ends or a signal comes: nothing that was read is lost."""
+"""Lines in, lines out, until the input ends or a signal comes; nothing that was read is lost."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from types import FrameType
 from typing import Any
 
 LONGEST_LINE = 1 << 20
-"""Bytes; a longer line is refused, so that a source without newlines can't fill the memory."""
+"""Bytes; a longer line is refused, so that input without newlines cannot fill the memory."""
 
 _CHUNK = 1 << 16
 _MOST_AFTER_STOP = 1 << 20
@@ -25,19 +25,19 @@ def serve(
     source: int = 0,
     sink: int = 1,
 ) -> bool:
-    """Answers every line of a file descriptor on another one, each as soon as it is there.
+    """Answers every line of a file descriptor on another one, each as soon as it arrives.
 
-    It ends with the input, and on SIGTERM or SIGINT after answering what had arrived; a second
-    signal does what signals do. A last line without a newline is a line.
+    Returns when the input ends, and on SIGTERM or SIGINT after answering what had arrived; a second
+    signal has its usual effect. A last line without a newline is a line.
 
     Args:
-        answer: a line, without its newline, to what is written for it; may be empty.
-        refuse: why a line was refused unread, to what is written for it.
+        answer: from a line without its newline to its answer, which may be empty.
+        refuse: from the reason why a line was not read to its answer.
         source: file descriptor to read from.
         sink: file descriptor to write to.
 
     Returns:
-        False if whoever read the answers went away before the end.
+        False if the reader of the answers closed the pipe before the end.
     """
     rest, skipping = b"", False
     with _stop_signals() as stop:
@@ -67,7 +67,7 @@ def _one(answer: Callable[[bytes], bytes], refuse: Callable[[str], bytes], line:
 
 
 def _chunks(source: int, stop: int) -> Iterator[bytes]:
-    """What arrives; once `stop` can be read, what has arrived already."""
+    """What arrives; once `stop` is readable, only what has arrived already."""
     budget = _MOST_AFTER_STOP
     while budget > 0:
         ready, _, _ = select.select([source, stop], [], [])
@@ -77,13 +77,13 @@ def _chunks(source: int, stop: int) -> Iterator[bytes]:
         if not chunk:
             return
         yield chunk
-        if stop in ready:  # nobody empties it, so it stays so
+        if stop in ready:  # it is never read, so it stays readable
             budget -= len(chunk)
 
 
 @contextmanager
 def _stop_signals() -> Iterator[int]:
-    """Yields a file descriptor that can be read from the first SIGTERM or SIGINT on."""
+    """Yields a file descriptor that is readable from the first SIGTERM or SIGINT on."""
     stop, wake = os.pipe()
     before: dict[int, Any] = {}
 
@@ -96,7 +96,7 @@ def _stop_signals() -> Iterator[int]:
         os.write(wake, b"x")
 
     try:
-        if threading.current_thread() is threading.main_thread():  # no other is told of signals
+        if threading.current_thread() is threading.main_thread():  # other threads get no signals
             for number in (signal.SIGTERM, signal.SIGINT):
                 before[number] = signal.signal(number, handle)
         yield stop
@@ -107,7 +107,7 @@ def _stop_signals() -> Iterator[int]:
 
 
 def _write(sink: int, data: bytes) -> None:
-    """All of it, however little is taken at a time."""
+    """All of it, however little is written at a time."""
     while data:
         try:
             data = data[os.write(sink, data) :]

@@ -1,4 +1,4 @@
-"""Where a message belongs: beside the rows, among them, aside, or nowhere."""
+"""Where a message belongs: after the rows, among them, or nowhere; and clocks that jump."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from offbeat.stream.options import Outcome, StreamCounters, StreamOptions
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Message:
-    """A message kept aside, its time as it came, its values as a row."""
+    """A pending message, its time as it came, its values as a row."""
 
     t: Time
     values: NDArray[Any]
@@ -27,47 +27,47 @@ class Message:
 
 
 class Placement:
-    """Makes rows in the order of time out of messages in any, by the policies, and counts.
+    """Makes rows in the order of time of messages in any order, and counts what it does.
 
     Args:
         engine: consumes the rows.
-        policies: what to do with messages out of order.
+        options: what to do with messages out of order.
         names: of the channels, for messages.
         time_unit: of all times.
-        median_gap: s, between the rows of the training part.
+        median_gap: s, between the rows of the training set.
         elapsed_limit: s without an observation, at which the model's time saturates.
 
     Raises:
-        InputError: an unknown unit, or policies that do not go with the model's usual gap.
+        InputError: an unknown unit, or options that do not fit the median gap of the model.
     """
 
     def __init__(
         self,
         engine: Engine,
-        policies: StreamOptions,
+        options: StreamOptions,
         *,
         names: tuple[str, ...],
         time_unit: str,
         median_gap: float,
         elapsed_limit: float,
     ) -> None:
-        self._engine, self._policies, self._names = engine, policies, names
-        self.clock, self.history = Clock(time_unit), History(engine, policies.kept_rows)
+        self._engine, self._options, self._names = engine, options, names
+        self.clock, self.history = Clock(time_unit), History(engine, options.kept_rows)
         self.counters = StreamCounters()
-        self.held: list[Message] = []
+        self.pending: list[Message] = []
         self.seen: float | None = None
         """s, time of the newest row in which anything was measured."""
         self.before_row: Callable[[float], None] | None = None
-        """Is told the time of each next row, before the engine consumes it."""
-        self._pause = median_gap + policies.merge_within_s
-        """s, that a jump of the clock is taken for."""
-        longest = policies.jump_ahead_s
-        if policies.jump == "continue" and longest is not None and longest <= self._pause:
+        """Called with the time of each next row, before the engine consumes it."""
+        self._pause = median_gap + options.merge_within_s
+        """s, the gap that replaces a jump of the clock."""
+        longest = options.jump_ahead_s
+        if options.jump == "continue" and longest is not None and longest <= self._pause:
             raise InputError(
-                f"jump_ahead_s is {longest!r}, no longer than the model's usual gap of "
+                f"jump_ahead_s is {longest!r}, no longer than the median gap of the model, "
                 f"{median_gap:g} s (and merge_within_s): every row would be a jump"
             )
-        limit = policies.long_gap_s
+        limit = options.long_gap_s
         self._long_gap = elapsed_limit if limit is None else limit
 
     @property
@@ -76,11 +76,11 @@ class Placement:
         return self.clock.at(self.history.newest) if self.history.rows else None
 
     def begin_anew(self) -> None:
-        """Nothing seen yet; the counters go on."""
+        """Nothing observed yet; the counters go on."""
         self._engine.reset()
         self.history.forget()
         self.clock.origin = None
-        self.held, self.seen = [], None
+        self.pending, self.seen = [], None
         self.counters.resets += 1
 
     def drop(self, outcome: Outcome) -> Outcome:
@@ -89,13 +89,13 @@ class Placement:
         return outcome
 
     def record(self) -> dict[str, Any]:
-        """All of it, as JSON knows it."""
+        """All of it, JSON-like."""
         return {
             "origin": self.clock.origin,
             "seen": self.seen,
             "history": self.history.record(),
-            "held": [
-                {"t": m.t, "values": encode(m.values), "mask": encode(m.mask)} for m in self.held
+            "pending": [
+                {"t": m.t, "values": encode(m.values), "mask": encode(m.mask)} for m in self.pending
             ],
             "counters": self.counters.to_dict(),
         }
@@ -111,13 +111,13 @@ class Placement:
         try:
             origin = None if record["origin"] is None else self.clock.read(record["origin"])
             seen = None if record["seen"] is None else seconds(record["seen"])
-            held = [
+            pending = [
                 Message(
                     self.clock.read(m["t"]),
-                    decode(m["values"], values, "values of a held message"),
-                    decode(m["mask"], mask, "mask of a held message"),
+                    decode(m["values"], values, "values of a pending message"),
+                    decode(m["mask"], mask, "mask of a pending message"),
                 )
-                for m in record["held"]
+                for m in record["pending"]
             ]
             counters = StreamCounters.from_dict(record["counters"])
             self.history.restore(record["history"], channels)
@@ -125,23 +125,23 @@ class Placement:
             what = f"{type(error).__name__}: {error}"
             raise InputError(f"the record of the stream is damaged ({what})") from None
         self.clock.origin, self.seen = origin, seen
-        self.held, self.counters = held, counters
+        self.pending, self.counters = pending, counters
 
     def take(
         self, t: Time, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
     ) -> Outcome:
-        """Puts a message where it belongs: beside the rows, aside, or nowhere."""
-        policies = self._policies
+        """Puts a message where it belongs."""
+        options = self._options
         if not self.history.rows:
             self.clock.origin = t
             return self._append(0.0, values, mask, measured)
         time = self.clock.seconds(t)
         ahead = time - self.history.newest
-        if ahead < -policies.jump_back_s or ahead > (policies.jump_ahead_s or math.inf):
+        if ahead < -options.jump_back_s or ahead > (options.jump_ahead_s or math.inf):
             return self._far(t, ahead, values, mask)
-        if self.held:
+        if self.pending:
             self._release()
-        if abs(ahead) <= policies.merge_within_s:
+        if abs(ahead) <= options.merge_within_s:
             return self._join(len(self.history.rows) - 1, values, mask)
         if ahead > 0:
             return self._append(time, values, mask, measured)
@@ -153,7 +153,7 @@ class Placement:
         """The next row."""
         gap = time - self.seen if measured and self.seen is not None else 0.0
         long = gap > self._long_gap
-        if long and self._policies.long_gap == "reset":
+        if long and self._options.long_gap == "reset":
             origin, floor = self.clock.origin, self.history.newest
             self.begin_anew()
             self.clock.origin, self.history.floor = origin, floor
@@ -172,13 +172,13 @@ class Placement:
         old = self.history.rows[i]
         twice = mask & old.mask
         repeated = bool(twice.any())
-        if repeated and self._policies.duplicates == "error":
+        if repeated and self._options.duplicates == "error":
             raise InputError(
                 f"measured twice at the time {self.clock.at(old.time)}: "
-                f"{', '.join(np.array(self._names)[twice])}; choose the policy duplicates='first' "
-                "or 'last' if that may be"
+                f"{', '.join(np.array(self._names)[twice])}; set duplicates to 'last' or "
+                "'first' to allow that"
             )
-        taken = mask if self._policies.duplicates == "last" else mask & ~old.mask
+        taken = mask if self._options.duplicates == "last" else mask & ~old.mask
         joined, union = np.where(taken, values, old.values), old.mask | taken
         changed = not (np.array_equal(joined, old.values) and np.array_equal(union, old.mask))
         if changed:
@@ -190,16 +190,16 @@ class Placement:
 
     def _late(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
         """A message older than the newest row."""
-        policies, behind = self._policies, self.history.newest - time
-        if behind > (policies.stale_after_s or math.inf):
+        options, behind = self._options, self.history.newest - time
+        if behind > (options.stale_after_s or math.inf):
             return self.drop("stale")
-        if policies.late == "error":
+        if options.late == "error":
             raise InputError(
                 f"a message is {behind:g} s older than the newest row, of the time {self.time}; "
-                "choose the policy late='drop' or 'reorder' if that may be"
+                "set late to 'drop' or 'reorder' to allow that"
             )
-        place = self.history.place(time, policies.merge_within_s)
-        if policies.late == "drop" or place is None:
+        place = self.history.place(time, options.merge_within_s)
+        if options.late == "drop" or place is None:
             return self.drop("late")
         i, joins = place
         if joins:
@@ -215,37 +215,37 @@ class Placement:
 
     def _far(self, t: Time, ahead: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
         """A message so far off that the clock may have jumped."""
-        policies = self._policies
-        if policies.jump == "error":
+        options = self._options
+        if options.jump == "error":
             newer = "newer" if ahead > 0 else "older"
             raise InputError(
                 f"a message is {abs(ahead):g} s {newer} than the newest row, of the time "
-                f"{self.time}; choose another policy of jump if that may be"
+                f"{self.time}; set jump to 'reset', 'continue' or 'drop' to allow that"
             )
-        if policies.jump == "drop":
+        if options.jump == "drop":
             if ahead > 0:
                 return self.drop("ahead")
             return self._late(self.clock.seconds(t), values, mask)
-        if self.held:
-            step = self.clock.between(t, self.held[-1].t)
-            if not -policies.jump_back_s <= step <= (policies.jump_ahead_s or math.inf):
+        if self.pending:
+            step = self.clock.between(t, self.pending[-1].t)
+            if not -options.jump_back_s <= step <= (options.jump_ahead_s or math.inf):
                 self._release()
-        self.held.append(Message(t, values, mask))
-        if len(self.held) < policies.confirm:
-            return "held"
-        held, self.held = sorted(self.held, key=lambda message: message.t), []
+        self.pending.append(Message(t, values, mask))
+        if len(self.pending) < options.confirm:
+            return "pending"
+        pending, self.pending = sorted(self.pending, key=lambda message: message.t), []
         self.counters.jumps_ahead += ahead > 0
         self.counters.jumps_back += ahead < 0
-        if policies.jump == "reset":
+        if options.jump == "reset":
             self.begin_anew()
         else:
-            self.clock.rebase(held[0].t, self.history.newest + self._pause)
-        for message in held:
-            self._take_held(message)
+            self.clock.rebase(pending[0].t, self.history.newest + self._pause)
+        for message in pending:
+            self._take_pending(message)
         return "jumped"
 
-    def _take_held(self, message: Message) -> None:
-        """Consumes what was held; what a policy calls an error is dropped: it came long ago."""
+    def _take_pending(self, message: Message) -> None:
+        """Consumes a pending message; what the options call an error is dropped: it is old."""
         try:
             measured = int(np.count_nonzero(message.mask))
             self.take(message.t, message.values, message.mask, measured)
@@ -253,9 +253,9 @@ class Placement:
             self.drop("late")
 
     def _release(self) -> None:
-        """The clock has not jumped: held messages are late ones, or too far ahead."""
-        held, self.held = self.held, []
-        for message in held:
+        """The clock has not jumped: pending messages are late, or too far ahead."""
+        pending, self.pending = self.pending, []
+        for message in pending:
             time = self.clock.seconds(message.t)
             if time > self.history.newest:
                 self.drop("ahead")

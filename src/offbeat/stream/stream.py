@@ -1,37 +1,41 @@
-"""`Stream`: a trained model, live."""
+"""`Stream`: a trained model that runs on messages as they arrive."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from offbeat.config import check_seed
+from offbeat.data.transforms import transforms_of
 from offbeat.models.model import Model
 from offbeat.stream.cpu_engine import CpuEngine
 from offbeat.stream.engine import Engine
-from offbeat.stream.live import Frame, LiveStream
+from offbeat.stream.live import LiveStream, StreamInfo
 from offbeat.stream.options import StreamOptions, with_options
+from offbeat.stream.replay import ReplayEngine
 from offbeat.stream.torch_engine import TorchEngine
 
 
 class Stream(LiveStream):
-    """A trained model fed with messages as they come; predictions at any time, in original units.
+    """A trained model that takes messages as they arrive, and predicts at any time.
 
-    A stream of increasing times is the batch pass over the same rows. What it does with messages
-    that are late, repeated, stale or on another clock is said by `StreamOptions`, and counted.
+    A stream of increasing times is the batch pass over the same rows, input transforms included:
+    an angle that is sent wrapped is predicted wrapped. `StreamOptions` says what is done with
+    messages that are late, repeated, stale or on another clock; all of it is counted.
 
-    Models of the thesis' protocol that `predict` refuses to ask for times can be asked here: the
-    answer is the prediction of a row at that time, should it come next, and no row is added. One
-    with `readout="last_row"` gives the same answer for every time.
+    Models that `predict` refuses to ask for times can be asked here: the prediction is that of a
+    row at that time, should it be the next one, and no row is added. A model with
+    `readout="last_row"` predicts the same for every time. A model without a recurrent state is run
+    again on its newest `window_rows` rows for each prediction.
 
     Args:
         model: trained; its weights must stay as they are.
-        policies: what to do with messages out of order.
+        options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns. Integers are exact.
         seed: of the generator of self-feeding.
-        **options: fields of `StreamOptions` that replace those of `policies`.
+        **fields: fields of `StreamOptions` that replace those of `options`.
 
     Raises:
-        InputError: an unknown unit or option, or a policy out of its range.
+        InputError: an unknown unit or option, or an option out of its range.
 
     Example:
         >>> stream = Stream(model, time_unit="ns", late="reorder")  # doctest: +SKIP
@@ -42,29 +46,36 @@ class Stream(LiveStream):
     def __init__(
         self,
         model: Model,
-        policies: StreamOptions | None = None,
+        options: StreamOptions | None = None,
         *,
         time_unit: str = "s",
         seed: int = 0,
-        **options: Any,
+        **fields: Any,
     ) -> None:
-        frame = Frame(
+        chosen = with_options(options, fields)
+        limit = float(getattr(getattr(model, "config", None), "gap_limit", None) or 1)
+        info = StreamInfo(
             names=model.names,
             units=model.units,
             scaler=model.scaler,
             median_gap=model.statistics.median_gap,
-            elapsed_limit=model.statistics.longest_elapsed * float(model.config.gap_limit or 1),
+            elapsed_limit=model.statistics.longest_elapsed * limit,
+            transforms=transforms_of(model),
         )
-        super().__init__(
-            engine_of(model, seed=check_seed(seed)),
-            frame,
-            policies=with_options(policies, options),
-            time_unit=time_unit,
-        )
+        engine = engine_of(model, seed=check_seed(seed), window=chosen.window_rows)
+        super().__init__(engine, info, options=chosen, time_unit=time_unit)
 
 
-def engine_of(model: Model, *, seed: int) -> Engine:
-    """The fastest engine that runs a model: compiled code where it can, else torch."""
-    if model.runs_compiled():
+def engine_of(model: Model, *, seed: int, window: int) -> Engine:
+    """The fastest engine that runs a model.
+
+    Args:
+        model: any.
+        seed: of the generator of self-feeding.
+        window: rows that a model without a recurrent state is run on.
+    """
+    if not isinstance(model, Model):
+        return ReplayEngine(model, window=window)
+    if CpuEngine.unsupported(model) is None:
         return CpuEngine(model, seed=seed)
     return TorchEngine(model, seed=seed)

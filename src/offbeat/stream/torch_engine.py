@@ -1,4 +1,4 @@
-"""Runs a model row by row through its own forward pass: a stream is a batch of one row."""
+"""Runs a recurrent model row by row by its own forward pass, as batches of one row."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from offbeat.stream.engine import Arrays, Engine
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A carry, and where its generator of generator stands; the generator itself moves on."""
+    """A recurrent state, and the state of its generator, which is shared and moves on."""
 
     carry: RecurrentState
     generator: Tensor | None
@@ -46,11 +46,11 @@ class TorchEngine(Engine):
         return np.dtype(str(self._model.dtype).removeprefix("torch."))
 
     def reserve(self, slots: int) -> None:
-        """Makes room for references: a carry is never changed, only followed by another."""
+        """Makes room for references: states are never changed, only followed by others."""
         self._slots = [None] * slots
 
     def reset(self) -> None:
-        """Begins anew, with the first coin."""
+        """Begins anew, with the first random number."""
         feeding = bool(self._model.config.self_feeding)
         generator = torch.Generator().manual_seed(self._seed) if feeding else None
         with torch.inference_mode():
@@ -75,14 +75,14 @@ class TorchEngine(Engine):
             raise
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Each time a trajectory of its own, all with this carry."""
+        """Each time as a trajectory of its own, all with the current state."""
         count, channels = len(times), self._model.channels
-        hidden = torch.zeros((count, 1, channels), dtype=torch.bool)
+        unseen = torch.zeros((count, 1, channels), dtype=torch.bool)
         asked = Batch(
             torch.tensor(times)[:, None],
             torch.zeros((count, 1, channels), dtype=self._model.dtype),
-            hidden,
-            hidden,
+            unseen,
+            unseen,
             self._valid.expand(count, 1),
         )
         carried = {
@@ -90,25 +90,25 @@ class TorchEngine(Engine):
             for name, part in _tensors(self._carry).items()
         }
         carry = replace(self._carry, **carried)  # type: ignore[arg-type]
-        if carry.generator is not None:  # a coin acts after the prediction is read
+        if carry.generator is not None:  # it acts after the prediction
             carry = replace(carry, generator=torch.Generator())
         with torch.inference_mode():
             predicted: Tensor = self._model(asked, carry=carry).predictions
             return predicted[:, 0].double().numpy()
 
     def save(self, slot: int) -> None:
-        """Keeps a reference to the carry."""
+        """Keeps a reference to the state."""
         self._slots[slot] = self._state()
 
     def load(self, slot: int) -> None:
-        """Goes back to a carry that was kept."""
+        """Goes back to a state that was kept."""
         kept = self._slots[slot]
         if kept is None:
             raise ValueError(f"nothing was saved in slot {slot}")
         self._take(kept)
 
     def export(self) -> Arrays:
-        """The parts of the carry, by their names; `rows`; and `generator`, where there are any."""
+        """The parts of the recurrent state by name, `rows`, and `generator` where there is one."""
         state = self._state()
         arrays = {name: part.numpy().copy() for name, part in _tensors(state.carry).items()}
         arrays["rows"] = np.array(state.carry.rows, dtype=np.int64)
@@ -117,7 +117,7 @@ class TorchEngine(Engine):
         return arrays
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes the parts of a carry."""
+        """Takes the parts of a recurrent state."""
         parts: dict[str, Any] = {name: torch.tensor(arrays[name]) for name in _tensors(self._carry)}
         carry = replace(self._carry, rows=int(arrays["rows"]), **parts)
         generator = torch.tensor(arrays["generator"]) if "generator" in arrays else None
@@ -126,7 +126,7 @@ class TorchEngine(Engine):
     def fingerprint(self) -> str:
         """Of config, statistics, scaler, channels and weights."""
         model = self._model
-        facts = {
+        record = {
             "model": asdict(model.config),
             "statistics": model.statistics.to_dict(),
             "scaler": model.scaler.to_dict(),
@@ -134,7 +134,7 @@ class TorchEngine(Engine):
             "units": model.units,
             "dtype": str(model.dtype),
         }
-        digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps(record, sort_keys=True).encode())
         for name, weight in sorted(model.state_dict().items()):
             digest.update(name.encode() + weight.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()

@@ -1,0 +1,98 @@
+"""A model without a recurrent state is streamed by running it again on its newest rows."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from model_helpers import dataset, small_model, trajectory
+from stream_helpers import message
+
+import offbeat as ob
+from offbeat.data.batch import Batch
+
+
+class Mixer(torch.nn.Module):
+    """Each row from the values, masks and times of all rows before it."""
+
+    def __init__(self, data: ob.Dataset) -> None:
+        super().__init__()
+        like = small_model("gru", data, dtype=torch.float64, scaler="standardise")
+        self.names, self.units, self.channels = like.names, like.units, like.channels
+        self.scaler, self.statistics, self.dtype = like.scaler, like.statistics, like.dtype
+        generator = torch.Generator().manual_seed(0)
+        weight = torch.randn(self.channels, 2 * self.channels, generator=generator)
+        self.weight = torch.nn.Parameter(weight.double())
+
+    def forward(self, batch: Batch) -> Any:
+        seen = torch.cat([torch.where(batch.mask, batch.values, 0.0), batch.mask.double()], dim=2)
+        age = batch.times[:, :, None] - batch.times[:, None, :]
+        before = torch.tril(torch.ones_like(age), -1)
+        return SimpleNamespace(mean=torch.einsum("bij,bjk,ck->bic", before * torch.exp(-age), seen,
+                                                 self.weight))  # fmt: skip
+
+
+def batch_predictions(model: Mixer, one: ob.Trajectory) -> Any:
+    with torch.no_grad():
+        mean = model(Batch.of([one], scaler=model.scaler, dtype=model.dtype)).mean[0]
+    return model.scaler.original(mean.numpy())
+
+
+def streamed(stream: ob.Stream, one: ob.Trajectory, rows: range) -> Any:
+    got = []
+    for row in rows:
+        got.append(stream.predict(one.times[row]))
+        stream.observe(one.times[row], message(one, row))
+    return np.array(got)
+
+
+def test_a_stream_of_any_module_predicts_what_its_batch_predicts() -> None:
+    model, one = Mixer(dataset(4)), trajectory(4, 14)
+    got = streamed(ob.Stream(model), one, range(14))
+    np.testing.assert_allclose(got, batch_predictions(model, one), rtol=0, atol=1e-12)
+
+
+def test_rows_older_than_the_window_do_not_count() -> None:
+    model, one = Mixer(dataset(4)), trajectory(4, 14)
+    stream = ob.Stream(model, window_rows=5)
+    streamed(stream, one, range(14))
+    asked = one.times[-1] + 0.1
+    newest = one.slice(9, 14)
+    longer = ob.Trajectory(
+        np.append(newest.times, asked),
+        np.vstack([newest.values, np.full(3, np.nan)]),
+        observed=np.vstack([newest.observed, np.zeros(3, dtype=bool)]),
+    )
+    expected = batch_predictions(model, longer)[-1]
+    np.testing.assert_allclose(stream.predict(asked), expected, rtol=0, atol=1e-12)
+    assert np.isfinite(ob.Stream(model, window_rows=1).predict(0.0)).all()
+
+
+def test_several_times_are_independent_and_the_newest_row_is_known_at_its_time() -> None:
+    model, one = Mixer(dataset(4)), trajectory(4, 8)
+    stream = ob.Stream(model)
+    streamed(stream, one, range(8))
+    asked = one.times[-1] + np.array([0.0, 0.3, 0.1])
+    each = [stream.predict(t) for t in asked]
+    np.testing.assert_allclose(stream.predict(asked), each, rtol=0, atol=1e-12)
+
+
+def test_late_rows_and_records_are_as_for_any_stream() -> None:
+    model, one = Mixer(dataset(4)), trajectory(4, 12)
+    in_time, late = (ob.Stream(model, late="reorder", window_rows=6) for _ in range(2))
+    streamed(in_time, one, range(8))
+    for row in (0, 1, 2, 3, 4, 6, 5, 7):
+        late.observe(one.times[row], message(one, row))
+    assert late.counters.reordered == 1
+    again = ob.Stream(model, late="reorder", window_rows=6)
+    again.restore(json.loads(json.dumps(late.state(), allow_nan=False)))
+    for stream in (late, again):
+        np.testing.assert_array_equal(stream.predict(9.0), in_time.predict(9.0))
+    with pytest.raises(ob.InputError):
+        ob.Stream(model, late="reorder", window_rows=7).restore(late.state())
+    again.reset()
+    np.testing.assert_array_equal(again.predict(9.0), ob.Stream(model).predict(9.0))
