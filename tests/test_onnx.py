@@ -297,7 +297,7 @@ def test_a_file_of_another_version_is_refused(exported: Any, tmp_path: Path) -> 
 
     model = onnx.load(exported("gru_d"))
     (entry,) = [e for e in model.metadata_props if e.key == "offbeat"]
-    entry.value = json.dumps(json.loads(entry.value) | {"version": 2})
+    entry.value = json.dumps(json.loads(entry.value) | {"version": 99})
     onnx.save(model, tmp_path / "model.onnx")
-    with pytest.raises(FileFormatError, match="of version 2, this Offbeat runs"):
+    with pytest.raises(FileFormatError, match="99"):
         OnnxStream(tmp_path / "model.onnx")

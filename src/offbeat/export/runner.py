@@ -25,6 +25,7 @@ METADATA = "offbeat"
 STATE = ("state", "time", "start", "observed_at", "channel_at", "last", "updated")
 """Inputs that hold the state; each comes out again with `_next`."""
 
+_NONE: dict[str, Any] = {"angles": {}, "quaternions": []}  # version 1 had no transforms
 _BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at": -np.inf}
 
 
@@ -146,10 +147,10 @@ class OnnxEngine(Engine):
 
 def _read(facts: Any) -> tuple[StreamInfo, Arrays]:
     """What the metadata says: the info of the stream, and the state before anything is observed."""
-    if facts["format"] != FORMAT or facts["version"] != VERSION:
+    if facts["format"] != FORMAT or facts["version"] not in (1, VERSION):
         raise FileFormatError(
             f"the ONNX file is a {facts['format']!r} of version {facts['version']!r}, this Offbeat "
-            f"runs {FORMAT!r} of version {VERSION}; export the model again"
+            f"runs {FORMAT!r} of versions 1 to {VERSION}; export the model again"
         )
     names = tuple(facts["names"])
     dtype = np.dtype(facts["dtype"])
@@ -166,6 +167,6 @@ def _read(facts: Any) -> tuple[StreamInfo, Arrays]:
         scaler=Scaler.identity(len(names)),
         median_gap=float(facts["median_gap_s"]),
         elapsed_limit=float(facts["elapsed_limit_s"]),
-        transforms=Transforms.from_dict(facts["transforms"]),
+        transforms=Transforms.from_dict(facts["transforms"] if facts["version"] > 1 else _NONE),
     )
     return info, {name: initial[name] for name in STATE}
