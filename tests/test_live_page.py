@@ -46,14 +46,14 @@ def test_the_blocks_run_one_after_the_other(tmp_path, monkeypatch, capsys):
     assert [json.loads(answer)["outcome"] for answer in answers] == ["new"] * 5
 
 
-def test_the_page_names_every_policy_counter_outcome_and_input():
+def test_the_page_names_every_option_counter_outcome_and_input():
     for record in (StreamOptions, StreamCounters):
         assert [f.name for f in fields(record) if f.name not in PAGE] == []
     assert [outcome for outcome in get_args(Outcome) if f"`{outcome}`" not in PAGE] == []
     assert [name for name in STATE if f"| `{name}` |" not in PAGE] == []
 
 
-def test_the_lines_of_the_page_are_those_that_a_session_knows():
+def test_the_lines_of_the_page_are_those_of_a_session():
     from stream_helpers import Recorded
 
     rows = re.findall(r"^\| `(\{.*?\})` \| (?:`(.*?)`)?", PAGE, re.MULTILINE)
