@@ -26,7 +26,8 @@ META_KEY = "transforms"
 
 _DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
 _UNIT_LENGTH = 1e-12  # a quaternion that is nearer to length 1 than this is not divided again
-_NO_LENGTH = 1e-6  # a quaternion that is shorter than this has no direction
+NO_LENGTH = 1e-6
+"""A quaternion that is shorter than this has no direction."""
 
 
 def full_turn(unit: str) -> float:
@@ -47,7 +48,7 @@ def lowest_of(low: float, high: float, period: float) -> float | None:
         neither range.
     """
     for lowest in (-period / 2, 0.0):
-        if _inside(low, lowest, period) and _inside(high, lowest, period):
+        if in_range(low, lowest, period) and in_range(high, lowest, period):
             return lowest
     return None
 
@@ -210,7 +211,7 @@ class Transforms:
                 values[:, at] = _wrapped_back(values[:, at], answer.times, trajectory, name, angle)
             for four in self.quaternions:
                 columns = [answer.names.index(name) for name in four]
-                values[:, columns] = _unit(values[:, columns])
+                values[:, columns] = unit_quaternions(values[:, columns])
             results.append(replace(answer, values=values))
         return replace(predicted, trajectories=tuple(results))
 
@@ -219,115 +220,6 @@ class Transforms:
             {name: angle for name, angle in self.angles.items() if name not in done.angles},
             tuple(four for four in self.quaternions if four not in done.quaternions),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class TransformState:
-    """What a stream must remember to transform its next row.
-
-    Attributes:
-        angle: (angles,) the last observation of each angle as it was sent; NaN before the first.
-        turns: (angles,) turns taken out of it.
-        in_range: (angles,) whether all observations so far lay in the range of the sensor.
-        quaternion: (quaternions, 4) the last observation, of length 1; NaN before the first.
-        sign: (quaternions,) 1 or -1, applied to it.
-    """
-
-    angle: Values
-    turns: Values
-    in_range: Mask
-    quaternion: Values
-    sign: Values
-
-
-class LiveTransforms:
-    """`Transforms` for one row after the other; the state is given and returned.
-
-    Args:
-        transforms: of the model.
-        names: channels of a row, in order.
-    """
-
-    def __init__(self, transforms: Transforms, names: Sequence[str]) -> None:
-        angles = transforms.restricted(names).angles
-        fours = transforms.restricted(names).quaternions
-        self._angles = np.array([names.index(name) for name in angles], dtype=np.int64)
-        self._periods = np.array([angle.period for angle in angles.values()])
-        self._lowest = np.array(
-            [np.nan if angle.lowest is None else angle.lowest for angle in angles.values()]
-        )
-        self._fours = [[names.index(name) for name in four] for four in fours]
-
-    def start(self) -> TransformState:
-        """Nothing observed yet."""
-        angles, quaternions = len(self._angles), len(self._fours)
-        return TransformState(
-            np.full(angles, np.nan),
-            np.zeros(angles),
-            ~np.isnan(self._lowest),
-            np.full((quaternions, 4), np.nan),
-            np.ones(quaternions),
-        )
-
-    def apply(
-        self, values: Values, mask: Mask, state: TransformState
-    ) -> tuple[Values, Mask, TransformState]:
-        """Transforms a row.
-
-        Args:
-            values: (channels,) as sent, in original units.
-            mask: (channels,) True where observed.
-            state: after the row before.
-
-        Returns:
-            Values and mask for the model, and the state after the row.
-        """
-        values, mask = values.copy(), mask.copy()
-        sent, seen = values[self._angles], mask[self._angles]
-        step = np.where(seen & ~np.isnan(state.angle), sent - state.angle, 0.0)
-        turns = state.turns + np.round(step / self._periods)
-        values[self._angles] = np.where(seen, sent - self._periods * turns, sent)
-        inside = _inside(sent, self._lowest, self._periods)
-        last, signs = state.quaternion.copy(), state.sign.copy()
-        for k, four in enumerate(self._fours):
-            own = mask[four]
-            if own.all():
-                unit = _unit(values[four][None])[0]
-                if _length(values[four][None])[0] <= _NO_LENGTH:
-                    mask[four] = False
-                    continue
-                if (unit * last[k]).sum() < 0:
-                    signs[k] = -signs[k]
-                last[k], values[four] = unit, unit * signs[k]
-            elif own.any():
-                values[four] = values[four] * signs[k]
-        return (
-            values,
-            mask,
-            TransformState(
-                np.where(seen, sent, state.angle),
-                turns,
-                state.in_range & (inside | ~seen),
-                last,
-                signs,
-            ),
-        )
-
-    def undo(self, predicted: Values, state: TransformState) -> Values:
-        """Takes predictions back to the convention of what was sent.
-
-        Args:
-            predicted: (times, channels) in original units.
-            state: after the newest row.
-        """
-        values = predicted.copy()
-        back = predicted[:, self._angles] + self._periods * state.turns
-        values[:, self._angles] = np.where(
-            state.in_range, _into_range(back, self._lowest, self._periods), back
-        )
-        for four in self._fours:
-            values[:, four] = _unit(values[:, four])
-        return values
 
 
 def _transformed(trajectory: Trajectory, transforms: Transforms) -> Trajectory:
@@ -367,22 +259,24 @@ def _counted(sent: Values, period: float) -> Values:
 
 def _continuous(four: Values, observed: Mask) -> tuple[Values, Mask]:
     """(n, 4) a quaternion without sign flips, of length 1, and what of it is observed."""
-    gone = observed.all(axis=1) & (_length(four) <= _NO_LENGTH)
+    gone = observed.all(axis=1) & (lengths(four) <= NO_LENGTH)
     four = np.where(gone[:, None], np.nan, four)
     observed = observed & ~gone[:, None]
-    unit = _unit(four)
-    at = np.flatnonzero(observed.all(axis=1))
-    if not len(at):
-        return unit, observed
-    flips = np.cumsum((unit[at][1:] * unit[at][:-1]).sum(axis=1) < 0)
-    signs = np.where(np.append(0, flips) % 2 == 1, -1.0, 1.0)
-    after = np.searchsorted(at, np.arange(len(four)), side="right") - 1
-    sign = np.where(after >= 0, signs[np.maximum(after, 0)], 1.0)
-    hidden = ~observed.any(axis=1)
-    nearest = unit[at[np.maximum(after, 0)]] * signs[np.maximum(after, 0), None]
-    sign = np.where(hidden, np.where((unit * nearest).sum(axis=1) < 0, -1.0, 1.0), sign)
-    whole = np.asarray(hidden | observed.all(axis=1))  # else its length is not known
-    return np.where(whole[:, None], unit, four) * sign[:, None], observed
+    complete, empty = observed.all(axis=1), ~observed.any(axis=1)
+    unit = unit_quaternions(four)
+    at = np.flatnonzero(complete)
+    sign = np.ones(len(four))
+    if len(at):
+        flips = np.cumsum((unit[at][1:] * unit[at][:-1]).sum(axis=1) < 0)
+        signs = np.where(np.append(0, flips) % 2 == 1, -1.0, 1.0)
+        before = np.searchsorted(at, np.arange(len(four)), side="right") - 1
+        last = np.maximum(before, 0)
+        # A row observed in part has the sign of the last one observed in full, a masked row the
+        # sign that is nearer to it.
+        nearer = np.where((unit * unit[at[last]]).sum(axis=1) < 0, -1.0, 1.0)
+        sign = np.where(empty, nearer * signs[last], np.where(before < 0, 1.0, signs[last]))
+    # The length of a row observed in part is not known.
+    return np.where((complete | empty)[:, None], unit, four) * sign[:, None], observed
 
 
 def _wrapped_back(
@@ -397,30 +291,31 @@ def _wrapped_back(
     back = np.asarray(predicted + angle.period * turns)
     if angle.lowest is None:
         return back
-    inside = np.logical_and.accumulate(np.asarray(_inside(sent, angle.lowest, angle.period)))
+    inside = np.logical_and.accumulate(np.asarray(in_range(sent, angle.lowest, angle.period)))
     wrapped = np.append(True, inside)[last]
-    return np.where(wrapped, _into_range(back, angle.lowest, angle.period), back)
+    return np.where(wrapped, into_range(back, angle.lowest, angle.period), back)
 
 
-def _inside(value: Any, lowest: Any, period: Any) -> Any:
+def in_range(value: Any, lowest: Any, period: Any) -> Any:
     """Whether a value lies within a turn from `lowest`; rounding to float32 does not matter."""
     slack = 1e-6 * period
     return (value >= lowest - slack) & (value <= lowest + period + slack)
 
 
-def _into_range(value: Values, lowest: Any, period: Any) -> Values:
+def into_range(value: Values, lowest: Any, period: Any) -> Values:
     """Values moved by whole turns into [lowest, lowest + period); those inside stay bit for bit."""
     return np.asarray(value - period * np.floor((value - lowest) / period))
 
 
-def _length(four: Values) -> Values:
+def lengths(four: Values) -> Values:
+    """(n,) the lengths of quaternions (n, 4)."""
     return np.asarray(np.sqrt((four * four).sum(axis=1)))
 
 
-def _unit(four: Values) -> Values:
+def unit_quaternions(four: Values) -> Values:
     """(n, 4) scaled to length 1; what has length 1 or none stays bit for bit."""
-    length = _length(four)
-    keep = (np.abs(length - 1) <= _UNIT_LENGTH) | ~(length > _NO_LENGTH)
+    length = lengths(four)
+    keep = (np.abs(length - 1) <= _UNIT_LENGTH) | ~(length > NO_LENGTH)
     return four / np.where(keep, 1.0, length)[:, None]
 
 

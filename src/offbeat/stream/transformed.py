@@ -4,17 +4,136 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.scaler import Scaler
-from offbeat.data.transforms import LiveTransforms, Transforms, TransformState
+from offbeat.data.transforms import (
+    NO_LENGTH,
+    Mask,
+    Transforms,
+    Values,
+    in_range,
+    into_range,
+    lengths,
+    unit_quaternions,
+)
 from offbeat.stream.engine import Arrays, Engine
 
 _PREFIX = "transforms."
+
+
+@dataclass(frozen=True, eq=False)
+class TransformState:
+    """What a stream must remember to transform its next row.
+
+    Attributes:
+        angle: (angles,) the last observation of each angle as it was sent; NaN before the first.
+        turns: (angles,) turns taken out of it.
+        in_range: (angles,) whether all observations so far lay in the range of the sensor.
+        quaternion: (quaternions, 4) the last observation, of length 1; NaN before the first.
+        sign: (quaternions,) 1 or -1, applied to it.
+    """
+
+    angle: Values
+    turns: Values
+    in_range: Mask
+    quaternion: Values
+    sign: Values
+
+
+class LiveTransforms:
+    """`Transforms` for one row after the other; the state is given and returned.
+
+    Args:
+        transforms: of the model.
+        names: channels of a row, in order.
+    """
+
+    def __init__(self, transforms: Transforms, names: Sequence[str]) -> None:
+        angles = transforms.restricted(names).angles
+        fours = transforms.restricted(names).quaternions
+        self._angles = np.array([names.index(name) for name in angles], dtype=np.int64)
+        self._periods = np.array([angle.period for angle in angles.values()])
+        self._lowest = np.array(
+            [np.nan if angle.lowest is None else angle.lowest for angle in angles.values()]
+        )
+        self._fours = [[names.index(name) for name in four] for four in fours]
+
+    def start(self) -> TransformState:
+        """Nothing observed yet."""
+        angles, quaternions = len(self._angles), len(self._fours)
+        return TransformState(
+            np.full(angles, np.nan),
+            np.zeros(angles),
+            ~np.isnan(self._lowest),
+            np.full((quaternions, 4), np.nan),
+            np.ones(quaternions),
+        )
+
+    def apply(
+        self, values: Values, mask: Mask, state: TransformState
+    ) -> tuple[Values, Mask, TransformState]:
+        """Transforms a row.
+
+        Args:
+            values: (channels,) as sent, in original units.
+            mask: (channels,) True where observed.
+            state: after the row before.
+
+        Returns:
+            Values and mask for the model, and the state after the row.
+        """
+        values, mask = values.copy(), mask.copy()
+        sent, seen = values[self._angles], mask[self._angles]
+        step = np.where(seen & ~np.isnan(state.angle), sent - state.angle, 0.0)
+        turns = state.turns + np.round(step / self._periods)
+        values[self._angles] = np.where(seen, sent - self._periods * turns, sent)
+        inside = in_range(sent, self._lowest, self._periods)
+        last, signs = state.quaternion.copy(), state.sign.copy()
+        for k, four in enumerate(self._fours):
+            own = mask[four]
+            if own.all():
+                unit = unit_quaternions(values[four][None])[0]
+                if lengths(values[four][None])[0] <= NO_LENGTH:
+                    mask[four] = False
+                    continue
+                if (unit * last[k]).sum() < 0:
+                    signs[k] = -signs[k]
+                last[k], values[four] = unit, unit * signs[k]
+            elif own.any():
+                values[four] = values[four] * signs[k]
+        return (
+            values,
+            mask,
+            TransformState(
+                np.where(seen, sent, state.angle),
+                turns,
+                state.in_range & (inside | ~seen),
+                last,
+                signs,
+            ),
+        )
+
+    def undo(self, predicted: Values, state: TransformState) -> Values:
+        """Takes predictions back to the convention of what was sent.
+
+        Args:
+            predicted: (times, channels) in original units.
+            state: after the newest row.
+        """
+        values = predicted.copy()
+        back = predicted[:, self._angles] + self._periods * state.turns
+        values[:, self._angles] = np.where(
+            state.in_range, into_range(back, self._lowest, self._periods), back
+        )
+        for four in self._fours:
+            values[:, four] = unit_quaternions(values[:, four])
+        return values
 
 
 class TransformedEngine(Engine):
