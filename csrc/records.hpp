@@ -10,8 +10,13 @@ namespace offbeat {
 constexpr int MAX_LAYERS = 16;
 constexpr int MAX_STAGES = 8;
 constexpr int MAX_GROUP = 128;
+// With these limits, no size of one row (layout.hpp, weights.hpp) overflows 64 bits: at most 2^20
+// steps of 8 stages of 17 layers of 2^20 units for 64 lanes and 128 rows is less than 2^62.
+constexpr int64_t MAX_UNITS = 1 << 20;     // of a layer, of the channels, of the hidden state
+constexpr int64_t MAX_STEPS = 1'000'000;   // of the solver over one gap
+constexpr int64_t MAX_COUNT = 2147483647;  // trajectories, rows
 
-enum Cell { CELL_NONE, CELL_SET, CELL_ELMAN, CELL_LSTM, CELL_GRU };
+enum Cell { CELL_NONE, CELL_START, CELL_ELMAN, CELL_LSTM, CELL_GRU };
 enum Activation { TANH, SILU };
 enum DecayRows { CONTINUOUS, EVERY_ROW, OBSERVED_ROWS };
 

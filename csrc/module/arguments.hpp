@@ -7,7 +7,25 @@ using Const = nb::ndarray<const T, nb::device::cpu>;
 template <class T>
 using Maybe = std::optional<Const<T>>;
 
-[[noreturn]] void refuse(const std::string& what) { throw nb::value_error(what.c_str()); }
+// Becomes offbeat.errors.InputError in Python.
+struct InputError : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+[[noreturn]] void refuse(const std::string& what) { throw InputError(what); }
+
+std::string text_of(double x) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%g", x);
+  return text;
+}
+
+int64_t in_range(const char* name, int64_t value, int64_t least, int64_t most) {
+  if (value < least || value > most)
+    refuse(std::string(name) + " is " + std::to_string(value) + ", expected " +
+           std::to_string(least) + " to " + std::to_string(most));
+  return value;
+}
 
 template <class A>
 std::string shape_of(const A& a) {
@@ -27,15 +45,19 @@ void check_shape(const char* name, const A& a, std::initializer_list<int64_t> sh
   }
   if (!good)
     refuse(std::string(name) + " has shape " + shape_of(a) + ", expected (" + wanted + ")");
-  if (shape.size() && *(shape.end() - 1) > 1 && a.stride(a.ndim() - 1) != 1)
-    refuse(std::string(name) + " must have its last axis contiguous");
+  const size_t last = a.ndim() - 1;
+  if (a.size() > 0 && a.shape(last) > 1 && a.stride(last) != 1)
+    refuse(std::string(name) + " has stride " + std::to_string(a.stride(last)) +
+           " along its last axis, expected 1; pass a contiguous array");
 }
 
 template <class A>
 void check_contiguous(const char* name, const A& a) {
+  if (a.size() == 0) return;
   int64_t stride = 1;
   for (size_t i = a.ndim(); i-- > 0;) {
-    if (a.shape(i) > 1 && a.stride(i) != stride) refuse(std::string(name) + " must be contiguous");
+    if (a.shape(i) > 1 && a.stride(i) != stride)
+      refuse(std::string(name) + " is not contiguous; pass a contiguous array");
     stride *= int64_t(a.shape(i));
   }
 }
@@ -78,7 +100,7 @@ int64_t flat_size(const Spec& s) {
   const int64_t g = gates_of(s), h = s.hidden;
   int64_t n = 0;
   if (s.cell != CELL_NONE) n += g * (2 * s.channels + s.time_inputs) + g;
-  if (s.cell > CELL_SET) n += g * h;
+  if (s.cell > CELL_START) n += g * h;
   if (s.reset_after) n += h;
   if (s.cell != CELL_NONE) n += g * s.anchored;
   if (s.decay_features) n += h * s.decay_features + h;
@@ -86,53 +108,74 @@ int64_t flat_size(const Spec& s) {
   return n + perceptron_flat(s.field) + perceptron_flat(s.decoder);
 }
 
-Perceptron perceptron_of(const std::vector<int>& sizes, int activation) {
+void check_decoder(const Perceptron& decoder, const Spec& s) {
+  const int in = decoder.sizes[0], out = decoder.sizes[decoder.layers];
+  if (in != s.hidden || out != s.channels)
+    refuse("the decoder maps " + std::to_string(in) + " units to " + std::to_string(out) +
+           ", expected " + std::to_string(s.hidden) + " to " + std::to_string(s.channels));
+}
+
+Perceptron perceptron_of(const std::vector<int64_t>& sizes, int64_t activation) {
   Perceptron p;
   if (sizes.empty()) return p;
-  if (sizes.size() < 2 || sizes.size() > MAX_LAYERS + 1)
-    refuse("a perceptron of the compiled backend has 1 to " + std::to_string(MAX_LAYERS) +
-           " layers, got " + std::to_string(int(sizes.size()) - 1));
-  for (int n : sizes)
-    if (n < 1) refuse("layer sizes must be at least 1, got " + std::to_string(n));
-  p.layers = int(sizes.size()) - 1;
-  std::copy(sizes.begin(), sizes.end(), p.sizes);
-  p.activation = activation;
+  p.layers = int(in_range("the number of layers", int64_t(sizes.size()) - 1, 1, MAX_LAYERS));
+  for (size_t i = 0; i < sizes.size(); ++i)
+    p.sizes[i] = int(in_range("the size of a layer", sizes[i], 1, MAX_UNITS));
+  p.activation = int(in_range("activation", activation, TANH, SILU));
   return p;
 }
 
-Spec spec_of(int channels, int hidden, int anchored, int time_inputs, int cell, bool reset_after,
-             const std::vector<int>& field, int activation,
-             const std::vector<std::vector<double>>& a, const std::vector<double>& b, int steps,
-             double max_step, int decay_features, int decay_rows, bool input_decay,
-             const std::vector<int>& decoder) {
+Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_inputs, int64_t cell,
+             bool reset_after, const std::vector<int64_t>& field, int64_t activation,
+             const std::vector<std::vector<double>>& a, const std::vector<double>& b, int64_t steps,
+             double max_step, int64_t decay_features, int64_t decay_rows, bool input_decay,
+             const std::vector<int64_t>& decoder) {
   Spec s;
-  s.channels = channels, s.hidden = hidden, s.anchored = anchored, s.time_inputs = time_inputs;
-  s.cell = cell, s.reset_after = reset_after;
-  if (channels < 1 || hidden < 1 || time_inputs < 0 || (anchored != 0 && anchored != channels))
-    refuse("sizes do not fit together: channels " + std::to_string(channels) + ", hidden " +
-           std::to_string(hidden) + ", anchored " + std::to_string(anchored));
-  if (cell < CELL_NONE || cell > CELL_GRU) refuse("unknown cell");
-  if (reset_after && cell != CELL_GRU) refuse("reset_after needs a GRU");
-  if (b.empty() || b.size() > MAX_STAGES || a.size() != b.size())
-    refuse("a tableau of the compiled backend has 1 to " + std::to_string(MAX_STAGES) +
-           " stages, got " + std::to_string(b.size()));
-  s.stages = int(b.size());
+  s.channels = int(in_range("channels", channels, 1, MAX_UNITS));
+  s.hidden = int(in_range("hidden_size", hidden, 1, MAX_UNITS));
+  s.time_inputs = int(in_range("time_inputs", time_inputs, 0, MAX_UNITS));
+  s.anchored = int(in_range("the number of anchored channels", anchored, 0, channels));
+  if (anchored && anchored != channels)
+    refuse("the number of anchored channels is " + std::to_string(anchored) + ", expected 0 or " +
+           std::to_string(channels));
+  s.cell = int(in_range("cell", cell, CELL_NONE, CELL_GRU));
+  s.reset_after = reset_after;
+  if (reset_after && cell != CELL_GRU) refuse("reset_after is True, but the cell is not a GRU");
+  s.stages = int(in_range("the number of stages", int64_t(b.size()), 1, MAX_STAGES));
+  if (a.size() != b.size()) refuse("a and b of the tableau differ in their number of stages");
   for (size_t i = 0; i < b.size(); ++i) {
     s.b[i] = b[i];
-    if (a[i].size() != i) refuse("a tableau's row i has i weights");
+    if (a[i].size() != i)
+      refuse("row " + std::to_string(i) + " of the tableau has " + std::to_string(a[i].size()) +
+             " weights, expected " + std::to_string(i));
     std::copy(a[i].begin(), a[i].end(), s.a[i]);
   }
-  if (steps < 1) refuse("steps must be at least 1");
-  s.steps = steps, s.max_step = max_step;
-  s.decay_features = decay_features, s.decay_rows = decay_rows, s.input_decay = input_decay;
+  s.steps = int(in_range("steps_per_gap", steps, 1, MAX_STEPS));
+  if (!(max_step >= 0) || std::isinf(max_step))
+    refuse("max_step is " + text_of(max_step) + ", expected a finite number above 0");
+  s.max_step = max_step;
+  s.decay_features = int(in_range("decay", decay_features, 0, MAX_UNITS));
+  s.decay_rows = int(in_range("decay_rows", decay_rows, CONTINUOUS, OBSERVED_ROWS));
+  s.input_decay = input_decay;
   s.field = perceptron_of(field, activation);
   s.decoder = perceptron_of(decoder, TANH);
-  const int driven = anchored + hidden;
+  const int64_t driven = anchored + hidden;
   if (s.field.layers && (field.front() != driven || field.back() != driven))
-    refuse("the vector field must map " + std::to_string(driven) + " units to themselves");
-  if (s.decoder.layers && (decoder.front() != hidden || decoder.back() != channels))
-    refuse("the decoder must map " + std::to_string(hidden) + " units to " +
-           std::to_string(channels) + " channels");
+    refuse("the vector field maps " + std::to_string(field.front()) + " units to " +
+           std::to_string(field.back()) + ", expected " + std::to_string(driven) + " to " +
+           std::to_string(driven));
+  if (s.decoder.layers) check_decoder(s.decoder, s);
   if (s.decoder.layers && anchored) refuse("an anchored state has no decoder");
   return s;
+}
+
+// Steps of the solver over a gap, at most.
+template <class T>
+int steps_of_gap(const Spec& s, T gap) {
+  if (!(s.max_step > 0) || !s.field.layers || !(gap > 0)) return s.steps;
+  const T steps = std::ceil(gap / T(s.max_step) - T(1e-6));
+  if (!(steps <= T(MAX_STEPS)))
+    refuse("a gap of " + text_of(gap) + " needs more than " + std::to_string(MAX_STEPS) +
+           " steps of at most max_step = " + text_of(s.max_step) + "; use a larger max_step");
+  return std::max(s.steps, int(steps));
 }

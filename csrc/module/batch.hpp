@@ -34,7 +34,7 @@ struct Call {
       b.lanes = int(std::min<int64_t>(batch - at, int64_t(b.vectors) * w));
       b.rows = length[at];
       b.tape = tape;
-      tape += int64_t(b.rows) * kernels.tape_row(s, job.max_steps, b.vectors);
+      tape = plus(tape, times(b.rows, kernels.tape_row(s, job.max_steps, b.vectors)));
       blocks.push_back(b);
       at += b.lanes;
     }
@@ -53,20 +53,16 @@ struct Call {
   }
 };
 
+// Steps of the solver over the longest gap; gaps after the last row of a trajectory do not count.
 template <class T>
-int most_steps(const Spec& s, const Quantity<T>& gap, const std::vector<int32_t>& source,
-               int64_t rows) {
-  int64_t most = s.steps;
-  if (s.max_step > 0 && s.field.layers) {
-    T longest = 0;
-    for (int64_t i : source)
-      for (int64_t j = 0; j < rows; ++j)
-        longest = std::max(longest, gap.data[i * gap.by_lane + j * gap.by_row]);
-    const T wanted = std::ceil(longest / T(s.max_step) - T(1e-6));
-    if (!(wanted < T(1e6))) refuse("a gap asks for over a million steps; raise max_step");
-    most = std::max<int64_t>(most, int64_t(wanted));
-  }
-  return int(most);
+int most_steps(const Spec& s, const Call<T>& call) {
+  const Quantity<T>& gap = call.job.inputs.gap;
+  T longest = 0;
+  if (s.max_step > 0 && s.field.layers)
+    for (size_t i = 0; i < call.source.size(); ++i)
+      for (int64_t row = 0; row < call.length[i]; ++row)
+        longest = std::max(longest, gap.data[call.source[i] * gap.by_lane + row * gap.by_row]);
+  return steps_of_gap(s, longest);
 }
 
 template <class T>
@@ -75,7 +71,8 @@ Call<T> prepare(const Spec& s, const Kernels<T>& kernels, const StepInputs<T>& f
   const int64_t batch = state.ndim() ? int64_t(state.shape(0)) : 0;
   check_shape("state", state, {batch, state_of(s)});
   check_contiguous("state", state);
-  if (batch < 1 || f.rows < 1) refuse("a scan needs at least one trajectory and one row");
+  in_range("the number of trajectories", batch, 1, MAX_COUNT);
+  in_range("the number of rows", f.rows, 1, MAX_COUNT);
   if (f.table) f.check_table(batch);
   Call<T> call;
   take_rows(call.job, s, f, batch);
@@ -86,7 +83,7 @@ Call<T> prepare(const Spec& s, const Kernels<T>& kernels, const StepInputs<T>& f
   }
   call.job.state = state.data();
   call.order_lanes(batch, f.rows, lengths, f.index ? f.index->data() : nullptr);
-  call.job.max_steps = most_steps(s, call.job.inputs.gap, call.source, f.rows);
+  call.job.max_steps = most_steps(s, call);
   call.plan(s, kernels);
   // Rows whose weight gradients are added together: about eight evaluations of the vector field.
   const int evaluations = s.field.layers ? s.stages * call.job.max_steps : 1;
@@ -98,7 +95,7 @@ template <class T>
 std::unique_ptr<Buffer<T>> packed(const Spec& s, const Kernels<T>& kernels,
                                   const Const<T>& weights) {
   check_shape("weights", weights, {flat_size(s)});
-  auto buffer = std::make_unique<Buffer<T>>(kernels.packed_size(s));
+  auto buffer = std::make_unique<Buffer<T>>("the packed weights", kernels.packed_size(s));
   kernels.pack(s, weights.data(), buffer->get());
   return buffer;
 }
@@ -160,9 +157,12 @@ void scan_backward(const Spec& s, const InstructionSet& set, const Const<T>& wei
   nb::gil_scoped_release unlocked;
   const auto weight = packed<T>(s, kernels, weights);
   job.packed = weight->get();
-  const Buffer<T> sums(int64_t(call.slots.size()) * kernels.sums_size(s));
+  const Buffer<T> sums("the gradient of the weights",
+                       times(int64_t(call.slots.size()), kernels.sums_size(s)));
   job.sums = sums.get();
-  const Buffer<T> state_gradients(int64_t(call.blocks.size()) * kernels.state_gradient_size(s));
+  const Buffer<T> state_gradients(
+      "the gradient of the states",
+      times(int64_t(call.blocks.size()), kernels.state_gradient_size(s)));
   job.state_gradients = state_gradients.get();
   std::vector<BlockRun> runs;
   for (const GradientSlot& slot : call.slots) {

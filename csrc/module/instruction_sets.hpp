@@ -25,8 +25,7 @@ const InstructionSet& find_instruction_set(const std::string& name) {
     if (name == b->name) return *b;
     names += std::string(names.empty() ? "" : ", ") + b->name;
   }
-  throw nb::value_error(
-      ("this processor does not run the instruction set '" + name + "', it runs " + names).c_str());
+  refuse("this processor does not run the instruction set '" + name + "', it runs " + names);
 }
 
 template <class T>

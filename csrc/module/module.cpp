@@ -7,9 +7,13 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <unistd.h>
+
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <cstdio>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -34,9 +38,9 @@ extern const InstructionSet kernels_avx512;
 
 namespace {
 
+#include "arguments.hpp"
 #include "instruction_sets.hpp"
 #include "threads.hpp"
-#include "arguments.hpp"
 #include "step_inputs.hpp"
 #include "batch.hpp"
 #include "perceptron.hpp"
@@ -52,7 +56,9 @@ void bind(nb::module_& m, const char* suffix) {
              Maybe<T> mask, Maybe<T> time_input, Maybe<T> decay_start, Maybe<T> decay_end,
              Maybe<T> delta, Maybe<T> last, Maybe<T> mean,
              std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length) {
-            if (!gap || gap->ndim() != 2) refuse("gap must have shape (batch, rows)");
+            if (!gap || gap->ndim() != 2)
+              refuse("gap has shape " + (gap ? shape_of(*gap) : "None") +
+                     ", expected (batch, rows)");
             const int64_t rows = int64_t(gap->shape(1));
             new (self) StepInputs<T>{{gap, update, updated, values, mask, time_input, decay_start,
                                       decay_end, delta, last},
@@ -74,11 +80,12 @@ void bind(nb::module_& m, const char* suffix) {
       .def(
           "__init__",
           [](StepInputs<T>* self, Const<T> table, Const<int64_t> index,
-             const std::vector<std::pair<int, int>>& places, int64_t rows, Maybe<T> mean,
+             const std::vector<std::pair<int64_t, int64_t>>& places, int64_t rows, Maybe<T> mean,
              std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length) {
-            if (table.ndim() != 3 || index.ndim() != 1)
-              refuse("a table must have three axes and its index one");
-            if (places.size() != QUANTITIES) refuse("a table needs a place for every quantity");
+            if (table.ndim() != 3)
+              refuse("table has shape " + shape_of(table) +
+                     ", expected (trajectories, rows, columns)");
+            in_range("the number of places", int64_t(places.size()), QUANTITIES, QUANTITIES);
             new (self) StepInputs<T>{{}, mean, use_prediction, length, table, index, places, rows};
           },
           nb::arg("table").noconvert(), nb::arg("index").noconvert(), nb::arg("places"),
@@ -147,6 +154,14 @@ void bind(nb::module_& m, const char* suffix) {
 NB_MODULE(_cpu, m) {
   using namespace offbeat;
   nb::set_leak_warnings(false);  // caches of specs live until the interpreter ends
+  nb::register_exception_translator([](const std::exception_ptr& error, void*) {
+    try {
+      std::rethrow_exception(error);
+    } catch (const InputError& e) {
+      const nb::object type = nb::module_::import_("offbeat.errors").attr("InputError");
+      PyErr_SetString(type.ptr(), e.what());
+    }
+  });
   m.doc() = "The compiled backend of the scan; offbeat.kernels.cpu calls it.";
   m.def("instruction_sets", [] {
     std::vector<std::string> names;
@@ -157,11 +172,11 @@ NB_MODULE(_cpu, m) {
   nb::class_<Spec>(m, "Spec")
       .def(
           "__init__",
-          [](Spec* self, int channels, int hidden, int anchored, int time_inputs, int cell,
-             bool reset_after, const std::vector<int>& field, int activation,
-             const std::vector<std::vector<double>>& a, const std::vector<double>& b, int steps,
-             double max_step, int decay_features, int decay_rows, bool input_decay,
-             const std::vector<int>& decoder) {
+          [](Spec* self, int64_t channels, int64_t hidden, int64_t anchored, int64_t time_inputs,
+             int64_t cell, bool reset_after, const std::vector<int64_t>& field, int64_t activation,
+             const std::vector<std::vector<double>>& a, const std::vector<double>& b, int64_t steps,
+             double max_step, int64_t decay_features, int64_t decay_rows, bool input_decay,
+             const std::vector<int64_t>& decoder) {
             new (self) Spec(spec_of(channels, hidden, anchored, time_inputs, cell, reset_after,
                                     field, activation, a, b, steps, max_step, decay_features,
                                     decay_rows, input_decay, decoder));
@@ -176,8 +191,8 @@ NB_MODULE(_cpu, m) {
   nb::class_<Perceptron>(m, "Perceptron")
       .def(
           "__init__",
-          [](Perceptron* self, const std::vector<int>& sizes, int activation) {
-            if (sizes.size() < 2) refuse("a perceptron needs sizes of its input and its output");
+          [](Perceptron* self, const std::vector<int64_t>& sizes, int64_t activation) {
+            in_range("the number of sizes", int64_t(sizes.size()), 2, MAX_LAYERS + 1);
             new (self) Perceptron(perceptron_of(sizes, activation));
           },
           nb::arg("sizes"), nb::arg("activation"));

@@ -4,7 +4,8 @@ template <class T>
 PerceptronJob<T> perceptron_job(const Perceptron& shape, const Const<T>& weights,
                                 const Const<T>& x) {
   check_shape("weights", weights, {perceptron_flat(shape)});
-  if (x.ndim() != 2) refuse("x must have shape (rows, inputs), got " + shape_of(x));
+  if (x.ndim() != 2) refuse("x has shape " + shape_of(x) + ", expected (rows, inputs)");
+  in_range("the number of rows", int64_t(x.shape(0)), 0, MAX_COUNT);
   check_shape("x", x, {int64_t(x.shape(0)), shape.sizes[0]});
   PerceptronJob<T> job;
   job.shape = &shape;
@@ -16,7 +17,8 @@ template <class T>
 int64_t perceptron_tape(const Perceptron& shape, const InstructionSet& set, int64_t rows) {
   const Kernels<T>& kernels = typed<T>(set);
   const int64_t w = 2 * kernels.width;
-  return (rows + w - 1) / w * kernels.perceptron_tape_row(shape);
+  in_range("the number of rows", rows, 0, MAX_COUNT);
+  return times((rows + w - 1) / w, kernels.perceptron_tape_row(shape));
 }
 
 template <class T>
@@ -32,7 +34,7 @@ void perceptron_forward(const Perceptron& shape, const InstructionSet& set, cons
     job.tape = tape->data();
   }
   nb::gil_scoped_release unlocked;
-  const Buffer<T> panels(kernels.perceptron_packed_size(shape));
+  const Buffer<T> panels("the packed weights", kernels.perceptron_packed_size(shape));
   kernels.perceptron_pack(shape, weights.data(), panels.get());
   job.packed = panels.get();
   const int64_t w = 2 * kernels.width, blocks = (job.n + w - 1) / w, batch = 16;
@@ -63,12 +65,13 @@ void perceptron_backward(const Perceptron& shape, const InstructionSet& set,
   job.to_y = to_y.data();
   T* flat = to_weights.data();
   nb::gil_scoped_release unlocked;
-  const Buffer<T> panels(kernels.perceptron_packed_size(shape));
+  const Buffer<T> panels("the packed weights", kernels.perceptron_packed_size(shape));
   kernels.perceptron_pack(shape, weights.data(), panels.get());
   job.packed = panels.get();
   const int64_t w = 2 * kernels.width, blocks = (job.n + w - 1) / w;
   job.slots = int(std::clamp<int64_t>(blocks / 32, 1, 16));
-  const Buffer<T> sums(job.slots * kernels.perceptron_sums(shape));
+  const Buffer<T> sums("the gradient of the weights",
+                       times(job.slots, kernels.perceptron_sums(shape)));
   job.sums = sums.get();
   spread<T>(job.slots, threads, kernels.perceptron_scratch(shape), [&](int64_t slot, T* scratch) {
     kernels.perceptron_backward(job, int(slot), scratch);

@@ -26,17 +26,18 @@ struct StepInputs {
   std::optional<Const<int64_t>> length;
   Maybe<T> table;  // (trajectories, rows, columns)
   std::optional<Const<int64_t>> index;
-  std::vector<std::pair<int, int>> places;  // first column and number of columns, 0: none
+  std::vector<std::pair<int64_t, int64_t>> places;  // first column and number of columns, 0: none
   int64_t rows = 0;
 
   Quantity<T> get(int which, int64_t batch, int units) const {
     if (!table) return quantity(NAMES[which], arrays[which], batch, rows, units);
     const auto [first, width] = places[which];
     if (!width) refuse(std::string(NAMES[which]) + " is missing; this scan needs it");
-    if (width != std::max(units, 1) || first < 0 || first + width > int64_t(table->shape(2)))
-      refuse(std::string(NAMES[which]) + " must have " + std::to_string(std::max(units, 1)) +
-             " columns inside the table, got columns " + std::to_string(first) + " to " +
-             std::to_string(first + width));
+    const int64_t wanted = std::max(units, 1), columns = int64_t(table->shape(2));
+    if (width != wanted || first < 0 || first > columns - width)
+      refuse(std::string(NAMES[which]) + " has " + std::to_string(width) + " columns from column " +
+             std::to_string(first) + " on, expected " + std::to_string(wanted) +
+             " columns inside the table of " + std::to_string(columns));
     return {table->data() + first, table->stride(0), table->stride(1)};
   }
 
@@ -44,14 +45,15 @@ struct StepInputs {
   void check_table(int64_t batch) const {
     check_shape("index", *index, {batch});
     check_contiguous("index", *index);
-    const int64_t n = int64_t(table->shape(0));
+    const int64_t n =
+        in_range("the number of trajectories in the table", int64_t(table->shape(0)), 0, MAX_COUNT);
     for (int64_t i = 0; i < batch; ++i)
       if (index->data()[i] < 0 || index->data()[i] >= n)
         refuse("index " + std::to_string(index->data()[i]) + " is not in the table of " +
                std::to_string(n) + " trajectories");
     if (rows > int64_t(table->shape(1)) || (table->shape(2) > 1 && table->stride(2) != 1))
       refuse("the table has shape " + shape_of(*table) + ", expected at least " +
-             std::to_string(rows) + " rows, and columns that lie in one piece");
+             std::to_string(rows) + " rows and contiguous columns");
   }
 };
 

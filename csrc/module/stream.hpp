@@ -7,7 +7,7 @@ enum TimeInput { TIME_INPUT_NONE, TIME_INPUT_ELAPSED, TIME_INPUT_GAP, TIME_INPUT
 
 struct TimeSettings {  // how a model reads time; units and limits in s
   double unit = 1, time_input_unit = 1, elapsed_limit = 1, longest_delta = 1;
-  int time_input = TIME_INPUT_NONE;
+  int64_t time_input = TIME_INPUT_NONE;
   bool from_first_row = false, last_row = false, every_row = false, starts_only = false;
   bool exponential = false;  // the decay depends on the elapsed time, not on delta
 };
@@ -16,42 +16,47 @@ template <class T>
 class StreamEngine {
  public:
   StreamEngine(const Spec& spec, const std::string& set, const Const<T>& weights,
-               const Const<T>& mean, const Const<T>& std, const std::vector<int>& decoder,
+               const Const<T>& mean, const Const<T>& std, const std::vector<int64_t>& decoder,
                const Maybe<T>& decoder_weights, const Const<T>& first_state,
                const TimeSettings& settings)
       : spec_(spec),
         kernels_(typed<T>(find_instruction_set(set))),
         time_(settings),
-        packed_(kernels_.stream_packed_size(spec)),
-        scratch_(kernels_.stream_scratch(spec)),
         decoder_(perceptron_of(decoder, TANH)),
-        decoder_packed_(decoder.empty() ? 1 : kernels_.stream_perceptron_size(decoder_)),
-        decoder_scratch_(decoder.empty() ? 1 : kernels_.stream_perceptron_scratch(decoder_)) {
-    const int C = spec.channels, S = state_of(spec);
+        packed_("the packed weights", kernels_.stream_packed_size(spec)),
+        scratch_("the scratch memory", kernels_.stream_scratch(spec)),
+        decoder_packed_("the packed decoder",
+                        decoder_.layers ? kernels_.stream_perceptron_size(decoder_) : 0),
+        decoder_scratch_("the scratch memory of the decoder",
+                         decoder_.layers ? kernels_.stream_perceptron_scratch(decoder_) : 0) {
+    const int C = spec.channels, F = spec.decay_features, S = state_of(spec);
+    const int64_t widths[] = {0, 1, 1, C};
+    in_range("time_input", time_.time_input, TIME_INPUT_NONE, TIME_INPUT_DELTA);
+    in_range("time_inputs", spec.time_inputs, widths[time_.time_input], widths[time_.time_input]);
+    if (F) in_range("decay", F, time_.exponential ? 1 : C, time_.exponential ? 1 : C);
     check_shape("weights", weights, {flat_size(spec)});
     check_shape("mean", mean, {C});
     check_shape("std", std, {C});
     check_shape("first_state", first_state, {S});
-    kernels_.stream_pack(spec_, weights.data(), packed_.get());
+    if (bool(decoder_.layers) == bool(spec.anchored))
+      refuse("a state has either anchored channels or a decoder");
     if (decoder_.layers) {
-      if (!decoder_weights) refuse("decoder_weights is missing; this model has a decoder");
+      check_decoder(decoder_, spec);
+      if (!decoder_weights) refuse("decoder_weights is None, but this model has a decoder");
       check_shape("decoder_weights", *decoder_weights, {perceptron_flat(decoder_)});
       kernels_.stream_perceptron_pack(decoder_, decoder_weights->data(), decoder_packed_.get());
-      if (decoder_.sizes[0] != spec.hidden || decoder_.sizes[decoder_.layers] != C)
-        refuse("the decoder does not fit the model");
     }
+    kernels_.stream_pack(spec_, weights.data(), packed_.get());
     mean_.assign(mean.data(), mean.data() + C);
     std_.assign(std.data(), std.data() + C);
     first_.state.assign(first_state.data(), first_state.data() + S);
     first_.last = mean_;
     first_.channel_at.assign(C, -INFINITY);
     now_ = first_;
-    for (std::vector<T>* v : {&values_, &mask_, &delta_, &last_, &start_, &end_})
-      v->assign(C, T(0));
+    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &out_}) v->assign(C, T(0));
     time_input_.assign(std::max(spec.time_inputs, 1), T(0));
     before_.assign(S, T(0));
     after_.assign(S, T(0));
-    out_.assign(std::max(C, 1), T(0));
   }
 
   void reset() { now_ = first_; }
@@ -85,7 +90,10 @@ class StreamEngine {
     }
   }
 
-  void reserve(int slots) { slots_.assign(slots, first_); }
+  void reserve(int64_t slots) {
+    in_range("slots", slots, 0, memory_limit() / (8 * size() + 256));
+    slots_.assign(size_t(slots), first_);
+  }
   void save(int slot) { slots_.at(slot) = now_; }
   void load(int slot) { now_ = slots_.at(slot); }
 
@@ -103,11 +111,13 @@ class StreamEngine {
   void restore(const Const<double>& in) {
     check_shape("state", in, {size()});
     const double* p = in.data();
+    const double rows = p[size() - 1];
+    if (!(rows >= 0 && rows < 9e15)) refuse("the state has " + text_of(rows) + " rows");
     for (T& v : now_.state) v = T(*p++);
     now_.time = *p++, now_.start = *p++, now_.observed_at = *p++;
     for (double& v : now_.channel_at) v = *p++;
     for (T& v : now_.last) v = T(*p++);
-    now_.updated = *p++ != 0, now_.rows = int64_t(*p++);
+    now_.updated = *p++ != 0, now_.rows = int64_t(rows);
   }
   int64_t rows() const { return now_.rows; }
 
@@ -170,6 +180,7 @@ class StreamEngine {
     row.use_prediction = use_prediction;
     row.state = now_.state.data(), row.before = before_.data(), row.after = after_.data();
     row.scratch = scratch_.get();
+    steps_of_gap(spec_, row.gap);  // raises where there are too many
     kernels_.stream_row(row);
   }
 
@@ -189,11 +200,10 @@ class StreamEngine {
   Spec spec_;
   const Kernels<T>& kernels_;
   TimeSettings time_;
-  Buffer<T> packed_, scratch_;
   Perceptron decoder_;
-  Buffer<T> decoder_packed_, decoder_scratch_;
-  std::vector<T> mean_, std_, values_, mask_, delta_, last_, start_, end_, time_input_, before_,
-      after_, out_;
+  Buffer<T> packed_, scratch_, decoder_packed_, decoder_scratch_;
+  std::vector<T> mean_, std_, values_, mask_, delta_, start_, end_, time_input_, before_, after_,
+      out_;
   State first_, now_;
   std::vector<State> slots_;
   bool observed_ = false, update_ = false;
@@ -206,10 +216,10 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
       .def(
           "__init__",
           [](StreamEngine<T>* self, const Spec& spec, const std::string& set, Const<T> weights,
-             Const<T> mean, Const<T> std, const std::vector<int>& decoder, Maybe<T> decoder_weights,
-             Const<T> first_state, double unit, double time_input_unit, double elapsed_limit,
-             double longest_delta, int time_input, bool from_first_row, bool last_row,
-             bool every_row, bool starts_only, bool exponential) {
+             Const<T> mean, Const<T> std, const std::vector<int64_t>& decoder,
+             Maybe<T> decoder_weights, Const<T> first_state, double unit, double time_input_unit,
+             double elapsed_limit, double longest_delta, int64_t time_input, bool from_first_row,
+             bool last_row, bool every_row, bool starts_only, bool exponential) {
             TimeSettings c;
             c.unit = unit, c.time_input_unit = time_input_unit, c.elapsed_limit = elapsed_limit;
             c.longest_delta = longest_delta, c.time_input = time_input,

@@ -95,13 +95,13 @@ static void flush(const Map& map, Pairs& pairs, int W, int lanes, T* sums, T* xt
 
 // Where the gradients of a row's affine maps lie until they are added; offsets in units.
 struct GradientLayout {
-  int gate, inner, start, end, decoder, field, field_size, size;
+  int64_t gate, inner, start, end, decoder, field, field_size, size;
 };
 static GradientLayout gradient_layout(const Spec& s, const Dims& d, int max_steps) {
   GradientLayout l{};
-  int at = 0;
+  int64_t at = 0;
   auto take = [&](int n) {
-    const int here = at;
+    const int64_t here = at;
     at += n;
     return here;
   };
@@ -143,7 +143,7 @@ static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int 
   for (int l = 0; l + 1 < shape.layers; ++l) to_out += int64_t(shape.sizes[l + 1]) * W;
   for (int l = shape.layers - 1; l >= 0; --l) {
     const Matrix& m = k.c.map.m[first + l];
-    const T* value = l ? kept + int64_t(n.value[l - 1]) * W : x;
+    const T* value = l ? kept + n.value[l - 1] * W : x;
     k.push(first + l, to_out, value);
     if (l == 0) {
       P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, to_x);
@@ -154,7 +154,7 @@ static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int 
       P::through_tanh(m, k.c.packed, k.c.lanes, to_out, value, to_value);
     } else {
       P::template transposed<false>(m, k.c.packed, k.c.lanes, to_out, k.z);
-      activate_backward<P>(shape.sizes[l], kept + int64_t(n.slope[l - 1]) * W, k.z, to_value);
+      activate_backward<P>(shape.sizes[l], kept + n.slope[l - 1] * W, k.z, to_value);
     }
     to_out = to_value;
   }
@@ -169,14 +169,14 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
   const Dims& d = c.map.d;
   const Layout<P>& l = c.l;
   constexpr int W = P::W;
-  auto at = [&](int units) { return tape + int64_t(units) * W; };
-  auto to = [&](int units) { return slot + int64_t(units) * W; };
-  T* gh = g + int64_t(l.h_at) * W;
+  auto at = [&](int64_t units) { return tape + units * W; };
+  auto to = [&](int64_t units) { return slot + units * W; };
+  T* gh = g + l.h_at * W;
   T* gate = to(k.places.gate);
   const bool values_need_gradient = f.active && (f.use_prediction || s.input_decay);
 
   if (f.active) {
-    cell_backward<P>(k, f, tape, slot, gh, g + int64_t(l.c_at) * W);
+    cell_backward<P>(k, f, tape, slot, gh, g + l.c_at * W);
     k.push(M_IN, gate, at(l.u));
     if (d.A) {
       k.push(M_INNOV, gate, at(l.innovation));
@@ -208,13 +208,13 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
     if (s.field.layers) {
       for (int i = 0; i < W; ++i) span[i] = T(q) < steps[i] ? f.gap[i] / steps[i] : T(0);
       T* kept = to(k.places.field) + int64_t(q) * s.stages * k.places.field_size * W;
-      runge_kutta_backward<P>(k, span, g, step + int64_t(l.stage) * W, kept);
+      runge_kutta_backward<P>(k, span, g, step + l.stage * W, kept);
     }
     if (!d.F) continue;
-    const T* applied = step + int64_t(l.applied) * W;
-    const T* factor = step + int64_t(l.factor) * W;
-    const T* arrived = step + int64_t(l.arrived) * W;
-    const T* previous = applied - int64_t(l.step_size) * W;
+    const T* applied = step + l.applied * W;
+    const T* factor = step + l.factor * W;
+    const T* arrived = step + l.arrived * W;
+    const T* previous = applied - l.step_size * W;
     P::each(d.H, [&](int64_t i, int lane) {
       const V first = load<T>(at(l.start) + i), last = load<T>(at(l.end) + i);
       const V fresh = load<T>(f.updated + lane);
@@ -312,8 +312,8 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
       store<T>(to_slope + i, sum * load<T>(span + lane));
     });
     const T* stage = stages + int64_t(j) * l.stage_size * W;
-    evaluate_backward<P>(k, s.field, M_FIELD, l.field_net, stage, stage + int64_t(l.network) * W,
-                         own, to_stage + j * size);
+    evaluate_backward<P>(k, s.field, M_FIELD, l.field_net, stage, stage + l.network * W, own,
+                         to_stage + j * size);
   }
   P::each(driven, [&](int64_t i, int) {
     V sum = load<T>(g + i);
@@ -332,13 +332,13 @@ static NOINLINE void cell_backward(Back<P>& k, const RowInputs<P>& f, const T* t
   const Layout<P>& l = c.l;
   constexpr int W = P::W;
   const int64_t n = int64_t(d.H) * W;
-  const T* h = tape + int64_t(l.before + l.h_at) * W;
-  const T* memory = tape + int64_t(l.before + l.c_at) * W;
-  const T* gate = tape + int64_t(l.gate) * W;
-  const T* inner = tape + int64_t(l.inner) * W;
-  T* to_gate = slot + int64_t(k.places.gate) * W;
+  const T* h = tape + (l.before + l.h_at) * W;
+  const T* memory = tape + (l.before + l.c_at) * W;
+  const T* gate = tape + l.gate * W;
+  const T* inner = tape + l.inner * W;
+  T* to_gate = slot + k.places.gate * W;
 
-  if (s.cell == CELL_SET) {
+  if (s.cell == CELL_START) {
     P::each(d.H, [&](int64_t i, int lane) {
       const V on = load<T>(f.update + lane), g = load<T>(gh + i);
       store<T>(to_gate + i, g * on);
@@ -369,7 +369,7 @@ static NOINLINE void cell_backward(Back<P>& k, const RowInputs<P>& f, const T* t
     P::template transposed<true>(c.map.m[M_REC], c.packed, c.lanes, to_gate, gh);
     return;
   }
-  T* to_inner = slot + int64_t(k.places.inner) * W;
+  T* to_inner = slot + k.places.inner * W;
   T* to_reset = k.z;
   P::each(d.H, [&](int64_t i, int lane) {
     const V on = load<T>(f.update + lane), g = load<T>(gh + i), update = load<T>(gate + i);
@@ -434,7 +434,7 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
   const int64_t W = P::W;
   T* state = take(d.S * W);
   const Context<P> c = context<P>(job, b, p, take(work_size<P>(s)));
-  const int64_t row_size = int64_t(c.l.size) * W, slot_size = int64_t(places.size) * W;
+  const int64_t row_size = c.l.size * W, slot_size = int64_t(places.size) * W;
   const int64_t inputs_size = row_inputs_size(d, P::W);
   Pairs pairs;
   T* z = take((widest<P>(s) + d.H) * W);  // the gradient of the applied exponent follows it

@@ -8,8 +8,8 @@ static NOINLINE void evaluate(const Context<P>& c, const Perceptron& shape, int 
     const bool last = l == shape.layers - 1;
     P::template affine<false>(m, c.packed, c.lanes, x, last ? out : z);
     if (last) break;
-    T* value = kept + int64_t(n.value[l]) * P::W;
-    activate<P>(shape.activation, shape.sizes[l + 1], z, value, kept + int64_t(n.slope[l]) * P::W);
+    T* value = kept + n.value[l] * P::W;
+    activate<P>(shape.activation, shape.sizes[l + 1], z, value, kept + n.slope[l] * P::W);
     x = value;
   }
 }
@@ -35,9 +35,9 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   const Dims& d = c.map.d;
   const Layout<P>& l = c.l;
   constexpr int W = P::W;
-  auto at = [&](int units) { return tape + int64_t(units) * W; };
-  T* h = state + int64_t(l.h_at) * W;
-  T* memory = state + int64_t(l.c_at) * W;
+  auto at = [&](int64_t units) { return tape + units * W; };
+  T* h = state + l.h_at * W;
+  T* memory = state + l.c_at * W;
   T* z = c.work;  // the widest layer fits
 
   // The cell's input: observed values, faded values, or the decoded state before the gap.
@@ -88,10 +88,10 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   for (int k = 0; k < most; ++k) {
     T* step = at(l.step) + int64_t(k) * l.step_size * W;
     if (d.F) {
-      T* applied = step + int64_t(l.applied) * W;
-      T* factor = step + int64_t(l.factor) * W;
-      T* arrived = step + int64_t(l.arrived) * W;
-      const T* previous = applied - int64_t(l.step_size) * W;
+      T* applied = step + l.applied * W;
+      T* factor = step + l.factor * W;
+      T* arrived = step + l.arrived * W;
+      const T* previous = applied - l.step_size * W;
       P::each(d.H, [&](int64_t i, int lane) {
         const V first = load<T>(start + i), last = load<T>(end + i);
         V applied_before;
@@ -120,7 +120,7 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
     if (!s.field.layers) break;
     for (int i = 0; i < (P::ONE ? VW : W); ++i)
       span[i] = T(k) < steps[i] ? f.gap[i] / steps[i] : T(0);
-    runge_kutta<P>(c, span, state, step + int64_t(l.stage) * W, z);
+    runge_kutta<P>(c, span, state, step + l.stage * W, z);
   }
 
   copy<P>(P::ONE ? l.state : d.S, state, at(l.before));
@@ -152,7 +152,7 @@ static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T
   constexpr int W = P::W;
   const int driven = P::ONE ? l.network : c.map.d.D;
   T* slopes = c.work + work_slopes<P>(s);
-  const int64_t size = int64_t(l.network) * W + (P::ONE ? VW : 0);
+  const int64_t size = l.network * W + (P::ONE ? VW : 0);
   for (int j = 0; j < s.stages; ++j) {
     T* stage = stages + int64_t(j) * l.stage_size * W;
     if (j == 0) {
@@ -165,8 +165,8 @@ static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T
         store<T>(stage + i, fma(load<T>(span + lane), sum, load<T>(state + i)));
       });
     }
-    evaluate<P>(c, s.field, M_FIELD, l.field_net, stage, stage + int64_t(l.network) * W,
-                slopes + j * size, z);
+    evaluate<P>(c, s.field, M_FIELD, l.field_net, stage, stage + l.network * W, slopes + j * size,
+                z);
   }
   P::each(driven, [&](int64_t i, int lane) {
     V sum = splat(0);
@@ -184,7 +184,7 @@ static NOINLINE void cell_forward(const Context<P>& c, const RowInputs<P>& f, T*
   const Dims& d = c.map.d;
   constexpr int W = P::W;
   const int64_t n = int64_t(P::pad(d.H)) * W;
-  if (s.cell == CELL_SET) {
+  if (s.cell == CELL_START) {
     P::each(d.H, [&](int64_t i, int lane) {
       const V on = load<T>(f.update + lane);
       store<T>(h + i, on * load<T>(gate + i) + (1 - on) * load<T>(h + i));
@@ -320,7 +320,7 @@ static void block_forward(const Job<T>& job, const Block& b, int begin, int end,
   T* own = work + work_size<P>(*job.spec);
   const Context<P> c = context<P>(job, b, p, work);
   RowInputs<P> f = row_inputs<P>(d, lanes);
-  const int64_t row_size = int64_t(c.l.size) * P::W;
+  const int64_t row_size = c.l.size * P::W;
   if (begin)
     collect<P>(job, b, job.after, begin - 1, d.S, false, state);
   else
@@ -331,7 +331,7 @@ static void block_forward(const Job<T>& job, const Block& b, int begin, int end,
       T* tape = job.tape ? job.tape + b.tape + row * row_size : own;
       gather<P>(job, d, b, row, f, 2);
       row_forward<P>(c, f, state, tape);
-      scatter<P>(job, b, job.before, row, tape + int64_t(c.l.before) * P::W, d.S);
+      scatter<P>(job, b, job.before, row, tape + c.l.before * P::W, d.S);
     } else {
       scatter<P>(job, b, job.before, row, state, d.S);
     }

@@ -39,7 +39,7 @@ static NOINLINE void units_to_lanes(const T* x, int units, int n, int W, T* cons
 
 // Offsets in units, each to be multiplied by the policy's W. `Net` is one evaluation.
 struct Net {
-  int value[MAX_LAYERS], slope[MAX_LAYERS], size;
+  int64_t value[MAX_LAYERS], slope[MAX_LAYERS], size;
 };
 template <class P>
 static Net net(const Perceptron& shape) {
@@ -53,17 +53,17 @@ static Net net(const Perceptron& shape) {
 }
 template <class P>
 struct Layout {
-  int u, start, end, before, gate, inner, innovation, decoded, h_before;
-  int decoder, step, step_size, applied, factor, arrived, stage, stage_size, y, network, size;
+  int64_t u, start, end, before, gate, inner, innovation, decoded, h_before;
+  int64_t decoder, step, step_size, applied, factor, arrived, stage, stage_size, y, network, size;
   Net field_net, decoder_net;
-  int x_at, h_at, c_at, state;  // inside a state
+  int64_t x_at, h_at, c_at, state;  // inside a state
 };
 template <class P>
 static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
   Layout<P> l{};
-  int at = 0;
+  int64_t at = 0;
   auto take = [&](int n) {
-    const int here = at;
+    const int64_t here = at;
     at += P::pad(n);
     return here;
   };
@@ -83,7 +83,7 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
   l.decoder = at, at += l.decoder_net.size;
   l.field_net = net<P>(s.field);
   l.step = at;
-  int step = 0;
+  int64_t step = 0;
   if (d.F) {
     l.applied = step, step += P::pad(d.H);
     l.factor = step, step += P::pad(d.H);
@@ -100,7 +100,7 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
 }
 // Every policy of blocks has the same layout in units.
 static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
-  return int64_t(layout<Many<1>>(s, dims(s), max_steps).size) * VW * vectors;
+  return layout<Many<1>>(s, dims(s), max_steps).size * VW * vectors;
 }
 
 // The step inputs of one row for the lanes of a block. A lane past its last row keeps its state.
@@ -112,7 +112,7 @@ struct RowInputs {
   bool active = false, use_prediction = false;
 };
 static constexpr int ROW_SCALARS = 4;
-static int row_inputs_size(const Dims& d, int lanes) {
+static int64_t row_inputs_size(const Dims& d, int lanes) {
   return ROW_SCALARS * (lanes < VW ? VW : lanes) + (4 * d.C + d.time_inputs + 2 * d.F) * lanes +
          widest_quantity(d);
 }

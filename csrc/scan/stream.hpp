@@ -1,7 +1,7 @@
 // One row of one trajectory, without a gradient: part of Scan<T> (scan.hpp). It runs the same
 // `row_forward` as a batch, with vectors over units in place of lanes.
 
-static int stream_inputs_size(const Dims& d) {
+static int64_t stream_inputs_size(const Dims& d) {
   return ROW_SCALARS * VW + 4 * up(d.C, VW) + up(d.time_inputs, VW) + 2 * up(d.F, VW) + up(d.C, VW);
 }
 static int64_t stream_scratch(const Spec& s) {
@@ -39,7 +39,7 @@ static void stream_row(const StreamRow<T>& row) {
   f.last = padded(row.last, d.C);
   f.mean = padded(row.mean, d.C);
   f.active = d.cell && row.update != 0;
-  f.use_prediction = row.use_prediction != 0;
+  f.use_prediction = row.use_prediction && s.decoder.layers;
 
   Layout<One> l = layout<One>(s, d, 1);
   // Later steps reuse the place of the first one, but for what a decay has applied so far: with
@@ -49,15 +49,15 @@ static void stream_row(const StreamRow<T>& row) {
   T* tape = take(l.size + VW);
   const Context<One> c{
       s, p, row.packed, row.packed + p.stream - 2 * up(d.C, VW), l, take(work_size<One>(s))};
-  const int place[3] = {0, l.h_at, l.c_at}, width[3] = {d.A, d.H, d.lstm ? d.H : 0};
+  const int64_t place[3] = {0, l.h_at, l.c_at}, width[3] = {d.A, d.H, d.lstm ? d.H : 0};
   auto unpadded = [&](const T* from, T* to) {
     for (int k = 0; k < 3; ++k)
-      for (int i = 0; i < width[k]; ++i) *to++ = from[place[k] + i];
+      for (int64_t i = 0; i < width[k]; ++i) *to++ = from[place[k] + i];
   };
   zero(state, l.state);
   const T* from = row.state;
   for (int k = 0; k < 3; ++k)
-    for (int i = 0; i < width[k]; ++i) state[place[k] + i] = *from++;
+    for (int64_t i = 0; i < width[k]; ++i) state[place[k] + i] = *from++;
   row_forward<One>(c, f, state, tape);
   unpadded(tape + l.before, row.before);
   unpadded(state, row.after);

@@ -85,7 +85,7 @@ static NOINLINE Map map(const Spec& s) {
     if (s.cell == CELL_GRU) {
       segments(add(M_REC, 2 * d.H, d.H, true, d.H), 2, d.H);
       add(M_CAND, d.H, d.H, true, d.H);
-    } else if (s.cell != CELL_SET) {
+    } else if (s.cell != CELL_START) {
       segments(add(M_REC, d.G, d.H, true, d.H), d.G / d.H, d.H);
     }
     if (s.reset_after) {
