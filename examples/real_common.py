@@ -274,7 +274,7 @@ def scores(log: Log, pair: ob.TwoSided, test: ob.Dataset) -> dict[str, Any]:
 
 def grouped(log: Log, found: ChannelScores) -> dict[str, dict[str, float | None]]:
     """RMSE over all cells of the channels of a group, in their unit, per predictor."""
-    cells = np.array(found.cells)
+    cells = np.array(found.counts)
     result = {}
     for group, channels in log.groups.items():
         at = [found.names.index(name) for name in channels]

@@ -141,7 +141,7 @@ def test_evaluate_scores_fills_and_forecasts_of_the_part_held_out(run, log, caps
     assert main(arguments) == 0
     text = capsys.readouterr().out
     assert "imputation: " in text
-    assert "extrapolation, 0.1 s: " in text
+    assert "forecast, 0.1 s: " in text
     assert "share of the models in the two-sided fill" in text
     for verdict in (said["imputation"]["verdict"], said["verdict"]):
         assert verdict in text
@@ -158,7 +158,7 @@ def test_other_data_is_hidden_in_any_way_and_scored_as_a_whole(run, log, tmp_pat
     data = ob.read(other, time_column="stamp", time_unit="ms")
     hidden = ob.mask_out(data, 0.6, mask="values")[0]
     expected = (data[0].observed & ~hidden.observed).sum(axis=0).tolist()
-    assert list(said["imputation"]["cells"].values()) == expected
+    assert list(said["imputation"]["counts"].values()) == expected
 
 
 def test_figures_are_written_on_request(run, log, tmp_path):
@@ -275,7 +275,7 @@ def test_the_lasa_example_runs_from_demonstrations_to_scores(tmp_path, capsys):
     assert results["imputation"]["units"] == {"x": "mm", "y": "mm", "vx": "mm/s", "vy": "mm/s"}
     capsys.readouterr()
     assert main(["evaluate", str(out), str(data), "--horizons=0.1"]) == 0
-    assert "extrapolation, 0.1 s: " in capsys.readouterr().out
+    assert "forecast, 0.1 s: " in capsys.readouterr().out
 
 
 def test_the_example_for_one_long_log_runs(log, tmp_path):

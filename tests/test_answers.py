@@ -19,7 +19,7 @@ from offbeat.answers.fill_rule import (
     START,
     FillRule,
     NormalEquations,
-    _held,
+    _ridge_solution,
     group_of,
 )
 from offbeat.answers.scoring import ChannelScores, _targets
@@ -157,7 +157,7 @@ def test_weights_are_the_least_squares_solution_with_the_ridge_as_extra_rows(see
     random = np.random.default_rng(seed)
     phi, y = random.normal(size=(30, 5)), random.normal(size=30)
     towards = random.normal(size=5)
-    got = _held(phi.T @ phi, phi.T @ y, 30, ridge, towards)
+    got = _ridge_solution(phi.T @ phi, phi.T @ y, 30, ridge, towards)
     root = np.sqrt(ridge * np.diag(phi.T @ phi) / 30)
     rows, right = np.vstack([phi, np.diag(root)]), np.concatenate([y, root * towards])
     expected = np.linalg.lstsq(rows, right, rcond=None)[0]
@@ -177,8 +177,8 @@ def test_many_cells_of_a_known_rule_give_its_weights_back_per_channel_and_group(
         equations.add(terms, missed, side, length, np.ones((rows, 2), dtype=bool))
     rule = equations.rule()
     np.testing.assert_allclose(rule.weights[:, 0, :4], true, atol=2e-3)
-    assert rule.cells[0, :4].sum() == 5 * 2 * rows
-    assert rule.cells[1:].sum() == 0
+    assert rule.counts[0, :4].sum() == 5 * 2 * rows
+    assert rule.counts[1:].sum() == 0
     assert np.array_equal(rule.weights[0, 1, 0], START[1]), "unseen sides keep the start"
     assert [names[0] for names in rule.chosen] == ["ridge 3"] * 2, "held as little as can be"
 
@@ -226,7 +226,7 @@ def test_a_rule_survives_json_to_the_last_bit():
     rule = pair_of(dataset(3)).rule
     again = FillRule.from_dict(json.loads(json.dumps(rule.to_dict())))
     assert again.weights.tobytes() == rule.weights.tobytes()
-    assert np.array_equal(again.cells, rule.cells)
+    assert np.array_equal(again.counts, rule.counts)
     assert (again.gap_unit, again.chosen) == (rule.gap_unit, rule.chosen)
 
 
@@ -344,7 +344,7 @@ def test_the_backward_model_is_one_trained_on_reversed_trajectories():
         assert a.equal(b)
     again = fit_rule(pair.forward, pair.backward, data[5:])
     assert np.array_equal(again.weights, pair.rule.weights)
-    assert again.cells.sum() == sum(int(masked_values(t).sum()) for t in data[5:])
+    assert again.counts.sum() == sum(int(masked_values(t).sum()) for t in data[5:])
 
 
 def test_a_two_sided_run_is_loaded_as_it_was_and_goes_on(tmp_path):
@@ -368,7 +368,7 @@ def test_a_damaged_rule_is_named(tmp_path, text):
     with pytest.raises(ob.FileFormatError, match=r"two_sided\.json is damaged"):
         ob.load_two_sided(tmp_path)
     (tmp_path / "two_sided.json").unlink()
-    with pytest.raises(ob.FileFormatError, match="no two-sided run"):
+    with pytest.raises(ob.FileFormatError, match="not a two-sided run"):
         ob.load_two_sided(tmp_path)
 
 
@@ -376,7 +376,7 @@ def test_a_rule_can_be_chosen_where_nothing_was_hidden():
     data = ob.Dataset(tuple(ob.Trajectory(t.times, t.values) for t in dataset(4, rows=20)))
     forward, backward = small_model("gru", data), small_model("gru", reversed_in_time(data))
     rule = fit_rule(forward, backward, data)
-    assert rule.cells.sum() == 4 * 3 * 6, "30 % of 20 cells, of 3 channels, of 4 trajectories"
+    assert rule.counts.sum() == 4 * 3 * 6, "30 % of 20 cells, of 3 channels, of 4 trajectories"
 
 
 # --- extrapolate ----------------------------------------------------------------------------------
@@ -437,7 +437,7 @@ def test_imputation_is_scored_by_its_definition_on_the_same_cells_for_all():
         **{m: [fill(t, m, mean) for t in data] for m in FILLERS},
     }
     hidden = [t.known & ~t.observed for t in data]
-    assert scores.cells == tuple(sum(h[:, c].sum() for h in hidden) for c in range(3))
+    assert scores.counts == tuple(sum(h[:, c].sum() for h in hidden) for c in range(3))
     scale = np.abs(pair.forward.scaler.scale) * np.array(pair.forward.statistics.std)
     for name, values in fills.items():
         errors = [
@@ -461,7 +461,7 @@ def test_groups_of_gaps_share_out_the_cells_between_observations():
             seen = np.flatnonzero(t.observed[:, c])
             between = np.arange(20)[(~t.observed[:, c])]
             inside += int(((between > seen[0]) & (between < seen[-1])).sum())
-    assert sum(sum(s.cells) for _, s in result.inside) == inside
+    assert sum(sum(s.counts) for _, s in result.inside) == inside
 
 
 def test_extrapolation_shows_what_was_there_a_horizon_ago_and_nothing_later():
@@ -499,7 +499,7 @@ def test_extrapolation_scores_are_those_of_the_definition():
     for name, pairs in errors.items():
         for c in range(3):
             each = np.array([e for channel, e in pairs if channel == c])
-            assert scores.cells[c] == len(each)
+            assert scores.counts[c] == len(each)
             assert scores.rmse[name][c] == pytest.approx(np.sqrt((each**2).mean()), rel=1e-9)
 
 
@@ -516,7 +516,7 @@ def test_targets_are_spread_over_the_trajectory_and_no_more_than_asked_for():
 def test_nothing_hidden_cannot_be_scored():
     data = ob.Dataset(tuple(ob.Trajectory(t.times, t.values) for t in dataset(2)))
     data = ob.Dataset(tuple(replace(t, units=("m",) * 3) for t in data))
-    with pytest.raises(ob.InputError, match="no cell is known and hidden"):
+    with pytest.raises(ob.InputError, match="masked"):
         ob.score_imputation(small_model("gru", data), data)
 
 
@@ -551,8 +551,8 @@ def test_one_step_ahead_scores_stand_in_units_beside_the_last_value():
             first = int(np.argmax(t.observed[:, c]))
             errors.append((p.values - t.values)[first + 1 :, c])
         each = np.concatenate(errors)
-        assert units.cells[c] == len(each)
+        assert units.counts[c] == len(each)
         assert units.rmse["gru"][c] == pytest.approx(np.sqrt((each**2).mean()), rel=1e-6)
     table = units.table().splitlines()
-    assert table[0].split() == ["channel", "unit", "cells", "gru", "last_value"]
+    assert table[0].split() == ["channel", "unit", "values", "gru", "last_value"]
     assert table[1].split()[:2] == ["channel_0", "m"]

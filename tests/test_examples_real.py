@@ -43,7 +43,7 @@ def check(said, result, out):
         }
         assert [s["horizon_s"] for s in scores["extrapolation"]] == [0.1, 0.2, 0.5, 1.0]
         for task in (one, filled, *scores["extrapolation"][:2]):
-            assert sum(task["cells"].values()) > 0
+            assert sum(task["counts"].values()) > 0
             assert all(math.isfinite(v) and v > 0 for v in task["rmse_scaled"].values())
         assert one["verdict"] in said
         assert filled["verdict"] in said
@@ -69,7 +69,7 @@ def test_the_lasa_example_scores_every_task_and_draws_its_figure(lasa):
 def test_lines_of_a_table_are_root_mean_squares_over_the_cells_of_their_channels(lasa):
     _, result, _ = lasa
     filled = result["scores"]["test"]["imputation"]
-    cells, each = filled["cells"], filled["rmse_in_units"]["linear"]
+    cells, each = filled["counts"], filled["rmse_in_units"]["linear"]
     squares = sum(cells[c] * each[c] ** 2 for c in ("vx", "vy"))
     expected = math.sqrt(squares / (cells["vx"] + cells["vy"]))
     assert filled["groups"]["velocity, mm/s"]["linear"] == pytest.approx(expected, rel=1e-12)

@@ -1,1 +1,1 @@
-"""Answers in original units: predictions, filled gaps, forecasts, and their scores."""
+"""Predictions, forecasts and fills in original units, and their scores."""

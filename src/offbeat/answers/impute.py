@@ -1,4 +1,4 @@
-"""Filling what was not observed; and the pair of models that fills from both sides."""
+"""Filling what was not observed, with one model or with a pair that fills from both sides."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MODES = ("causal", "two_sided")
 """Ways of filling: from the past alone, or from both sides."""
 
 RULE_FILE = "two_sided.json"
-"""Where a run keeps its rule; `backward` beside it is the run of the backward model."""
+"""File of the rule in a run's folder; `backward` beside it is the run of the backward model."""
 
 
 def impute(
@@ -41,11 +41,11 @@ def impute(
     mode: Literal["causal", "two_sided"] | None = None,
     seed: int = 0,
 ) -> Dataset:
-    """Fills every cell that is not observed: hidden ones, and those that were never measured.
+    """Fills every value that is not observed: masked ones, and those that were never measured.
 
-    `causal` gives a cell what the model predicts there from what was observed strictly before its
-    row. `two_sided` joins that with what a backward model says from the other side, by the rule in
-    `offbeat.answers.two_sided`. Neither looks at the cell itself, or at other hidden ones.
+    `causal` fills with the model's prediction from what was observed strictly before the row.
+    `two_sided` combines it with the prediction of a backward model from the other side, by the rule
+    in `offbeat.answers.two_sided`. Neither uses masked values.
 
     Args:
         model: a trained model, or a pair from `fit_two_sided`.
@@ -54,8 +54,8 @@ def impute(
         seed: of the generator of self-feeding.
 
     Returns:
-        The trajectories, channels in the order of the model, in original units. No cell is NaN;
-        `observed` says which were measured, and False there is a cell that was filled.
+        The trajectories, channels in the order of the model, in original units. No value is
+        NaN; `observed` is True where it was measured, and False where it was filled.
 
     Raises:
         InputError: other channels than the model's, or two-sided filling asked of a single model.
@@ -107,15 +107,15 @@ def fit_two_sided(
     seed: int = 0,
     progress: bool = True,
 ) -> tuple[TwoSided, FitResult, FitResult]:
-    """Trains a model, its counterpart on reversed trajectories, and the rule that joins them.
+    """Trains a model, a second one on reversed trajectories, and the rule that combines them.
 
     Args:
-        model: trained in place, as by `fit`; the backward one is made with its config and scaler.
-        train: the training part.
-        validation: scored after each epoch; the rule is chosen on its hidden cells.
+        model: trained in place, as by `fit`; the backward model has its config and scaler.
+        train: the training set.
+        validation: scored after each epoch; the rule is fitted to its masked values.
         config: of both trainings; by default `TrainConfig()`.
         out: folder of the run; the backward model's is `backward` inside it. A run that was stopped
-            goes on where it was.
+            is resumed.
         seed: of the initial weights of the backward model.
         progress: show progress bars.
 
@@ -171,7 +171,7 @@ def load_two_sided(path: str | Path) -> TwoSided:
     path = Path(path)
     if not (path / RULE_FILE).is_file():
         raise FileFormatError(
-            f"{path} has no {RULE_FILE}: it is no two-sided run; train with --two_sided true"
+            f"{path} has no {RULE_FILE}: it is not a two-sided run; train with --two_sided true"
         )
     try:
         rule = FillRule.from_dict(json.loads((path / RULE_FILE).read_text(encoding="utf-8")))

@@ -1,4 +1,4 @@
-"""Fills and forecasts beside trivial predictors: all on the same cells, in original units."""
+"""Scores of fills and forecasts beside trivial predictors, on the same values, in their units."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from offbeat.errors import InputError
 from offbeat.models.model import Model
 
 OVERALL = "all, scaled"
-"""Name of the last line of a table: all channels together, in units of their training spread."""
+"""Name of the last line of a table: all channels, in units of their standard deviation."""
 
 
 @dataclass(frozen=True)
 class ChannelScores:
-    """RMSE of several predictors on the same cells, per channel in its unit.
+    """RMSE of several predictors on the same values, per channel in its unit.
 
     Attributes:
-        task: what was predicted, as a heading says it.
+        task: what was predicted, for headings.
         names: of the channels.
         units: of the channels.
-        cells: per channel, how many were scored.
-        rmse: per predictor, per channel; NaN where a channel has no cell.
-        overall: per predictor, over the cells of all channels, each in units of its scale.
+        counts: per channel, how many values were scored.
+        rmse: per predictor, per channel; NaN where a channel has no value.
+        overall: per predictor, over the values of all channels, each in units of its scale.
         trivial: which of the predictors are trivial.
     """
 
     task: str
     names: tuple[str, ...]
     units: tuple[str, ...]
-    cells: tuple[int, ...]
+    counts: tuple[int, ...]
     rmse: Mapping[str, tuple[float, ...]]
     overall: Mapping[str, float]
     trivial: tuple[str, ...]
@@ -49,31 +49,31 @@ class ChannelScores:
     def table(self) -> str:
         """A plain-text table, a line per channel, a column per predictor."""
         predictors = list(self.rmse)
-        lines = [["channel", "unit", "cells", *predictors]]
-        each = zip(self.names, self.units, self.cells, strict=True)
+        lines = [["channel", "unit", "values", *predictors]]
+        each = zip(self.names, self.units, self.counts, strict=True)
         for i, (name, unit, count) in enumerate(each):
             numbers = [_shown(self.rmse[p][i]) for p in predictors]
             lines.append([name, unit or "-", str(count), *numbers])
         overall = [_shown(self.overall[p]) for p in predictors]
-        lines.append([OVERALL, "-", str(sum(self.cells)), *overall])
+        lines.append([OVERALL, "-", str(sum(self.counts)), *overall])
         return _aligned(lines)
 
     def verdict(self) -> str:
-        """Which predictor is best, in words; where a trivial one wins, it says so."""
+        """Which predictor is best, in words, and where a trivial one is."""
         ranked = sorted((v, name) for name, v in self.overall.items() if v == v)
         if not ranked:
             return f"{self.task}: nothing to score"
         best_trivial = next((v, name) for v, name in ranked if name in self.trivial)
         models = [(v, name) for v, name in ranked if name not in self.trivial]
-        said = [f"{self.task}: "]
+        text = [f"{self.task}: "]
         if not models or models[0][0] >= best_trivial[0]:
             against = f", the model has {_shown(models[0][0])}" if models else ""
-            said.append(
+            text.append(
                 f"the trivial predictor {best_trivial[1]} wins with RMSE "
                 f"{_shown(best_trivial[0])} (scaled){against}"
             )
         else:
-            said.append(
+            text.append(
                 f"{models[0][1]} wins with RMSE {_shown(models[0][0])} (scaled), the best trivial "
                 f"predictor, {best_trivial[1]}, has {_shown(best_trivial[0])}"
             )
@@ -84,16 +84,16 @@ class ChannelScores:
                 lost.append(f"{name} ({who})")
         if lost:
             shown = ", ".join(lost[:8]) + (", ..." if len(lost) > 8 else "")
-            said.append(
+            text.append(
                 f"; a trivial predictor wins in {len(lost)} of {len(self.names)} channels: {shown}"
             )
-        return "".join(said)
+        return "".join(text)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form; null where there is no cell."""
+        """JSON-like form; null where there is no value."""
         return {
             "task": self.task,
-            "cells": dict(zip(self.names, self.cells, strict=True)),
+            "counts": dict(zip(self.names, self.counts, strict=True)),
             "units": dict(zip(self.names, self.units, strict=True)),
             "rmse_in_units": {
                 predictor: dict(zip(self.names, map(_plain, values), strict=True))
@@ -105,7 +105,7 @@ class ChannelScores:
 
 
 class ErrorSums:
-    """Adds up squared errors of predictors, trajectory by trajectory, on cells they share.
+    """Adds up squared errors of predictors, trajectory by trajectory, on the same values.
 
     Args:
         names: of the channels.
@@ -116,7 +116,7 @@ class ErrorSums:
     def __init__(self, names: Sequence[str], units: Sequence[str], scale: ArrayLike) -> None:
         self.names, self.units = tuple(names), tuple(units)
         self.scale = np.asarray(scale, dtype=np.float64)
-        self._cells = np.zeros(len(self.names), dtype=np.int64)
+        self._counts = np.zeros(len(self.names), dtype=np.int64)
         self._sums: dict[str, NDArray[np.float64]] = {}
 
     def add(
@@ -130,20 +130,20 @@ class ErrorSums:
         Args:
             truth: (rows, channels) known where counted.
             predictions: per predictor (rows, channels); the same predictors in every call.
-            counted: (rows, channels) cells that are scored.
+            counted: (rows, channels) values that are scored.
         """
-        self._cells += counted.sum(axis=0)
+        self._counts += counted.sum(axis=0)
         for name, values in predictions.items():
             squared = np.where(counted, values - truth, 0.0) ** 2
             self._sums[name] = self._sums.get(name, 0.0) + squared.sum(axis=0)
 
     def scores(self, task: str, trivial: Sequence[str]) -> ChannelScores:
         """The scores of everything added so far."""
-        cells, total = self._cells, int(self._cells.sum())
+        counts, total = self._counts, int(self._counts.sum())
         each = {
             name: tuple(
                 float((s / n) ** 0.5) if n else float("nan")
-                for s, n in zip(sums, cells, strict=True)
+                for s, n in zip(sums, counts, strict=True)
             )
             for name, sums in self._sums.items()
         }
@@ -152,17 +152,17 @@ class ErrorSums:
             for name, sums in self._sums.items()
         }
         return ChannelScores(
-            task, self.names, self.units, tuple(cells.tolist()), each, overall, tuple(trivial)
+            task, self.names, self.units, tuple(counts.tolist()), each, overall, tuple(trivial)
         )
 
 
 @dataclass(frozen=True)
 class ImputationScores:
-    """Imputation scores of all hidden cells, and by the length of the gap they lie in.
+    """Imputation scores of all masked values, and by the length of their gap.
 
     Attributes:
-        scores: of all hidden cells.
-        inside: s, upper end of each group of gaps, and the scores of the hidden cells that have an
+        scores: of all masked values.
+        inside: s, upper end of each group of gaps, and the scores of the masked values with an
             observation of their channel on both sides, that far apart.
     """
 
@@ -172,24 +172,24 @@ class ImputationScores:
     def table(self) -> str:
         """A table per channel, and one by length of the gap."""
         predictors = list(self.scores.rmse)
-        lines = [["gap up to", "cells", *predictors]]
+        lines = [["gap up to", "values", *predictors]]
         for up_to, scores in self.inside:
             numbers = [_shown(scores.overall[p]) for p in predictors]
-            lines.append([f"{up_to:.3g} s", str(sum(scores.cells)), *numbers])
+            lines.append([f"{up_to:.3g} s", str(sum(scores.counts)), *numbers])
         by_gap = f"\nscaled, by time between the observations around:\n{_aligned(lines)}"
         return self.scores.table() + (by_gap if self.inside else "")
 
     def verdict(self) -> str:
         """Which predictor is best, in words, and in which gaps a trivial one is."""
-        said = self.scores.verdict()
+        text = self.scores.verdict()
         lost = []
         for up_to, scores in self.inside:
             value, who = min((scores.overall[p], p) for p in scores.overall)
             if value == value and who in scores.trivial:
                 lost.append(f"{up_to:.3g} s ({who})")
         if lost:
-            said += f"; in gaps of up to {', '.join(lost)} a trivial predictor wins"
-        return said
+            text += f"; in gaps of up to {', '.join(lost)} a trivial predictor wins"
+        return text
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form."""
@@ -197,7 +197,7 @@ class ImputationScores:
             **self.scores.to_dict(),
             "verdict": self.verdict(),
             "by_gap": [
-                {"up_to_s": up_to, "cells": sum(s.cells), "rmse_scaled": dict(s.overall)}
+                {"up_to_s": up_to, "count": sum(s.counts), "rmse_scaled": dict(s.overall)}
                 for up_to, s in self.inside
             ],
         }
@@ -206,7 +206,7 @@ class ImputationScores:
 def fills_of(
     model: Model | TwoSided, dataset: Dataset, *, seed: int = 0
 ) -> dict[str, list[NDArray[np.float64]]]:
-    """What each predictor fills in, by its name: the model, causal and two-sided; trivial ones.
+    """The fills of each predictor by name: the model, causal and two-sided, and trivial ones.
 
     Args:
         model: a trained model, or a pair.
@@ -229,23 +229,23 @@ def fills_of(
 def score_imputation(
     model: Model | TwoSided, dataset: Dataset, *, seed: int = 0
 ) -> ImputationScores:
-    """Scores fills of all hidden cells, beside last value, linear interpolation and PCHIP.
+    """Scores fills of all masked values, beside last value, linear interpolation and PCHIP.
 
-    Every cell that is known and hidden counts, for every predictor.
+    Every value that is known and masked counts, for every predictor.
 
     Args:
         model: a trained model, or a pair, which is scored causal and two-sided.
-        dataset: with hidden cells, as `mask_out` makes them.
+        dataset: with masked values, from `mask_out`.
         seed: of the generator of self-feeding.
 
     Raises:
-        InputError: nothing is hidden, or other channels than the model's.
+        InputError: nothing is masked, or other channels than the model's.
     """
     forward = model.forward if isinstance(model, TwoSided) else model
     dataset = transforms_of(forward).apply(in_model_order(forward, dataset))
     if not any(masked_values(t).any() for t in dataset):
         raise InputError(
-            "no cell is known and hidden, so no fill can be scored; hide some with thin "
+            "no value is known and masked, so no fill can be scored; mask some with mask_out "
             "(--observed_fraction)"
         )
     fills = fills_of(model, dataset, seed=seed)
@@ -272,12 +272,12 @@ def score_forecast(
 ) -> tuple[ChannelScores, ...]:
     """Scores forecasts at fixed horizons, beside the last value and constant velocity.
 
-    For a row at time t and a horizon h, every predictor sees the rows up to t - h and is asked for
-    t; the cells of that row which are known, and whose channel had been observed by t - h, count.
+    For a row at time t and a horizon h, every predictor is given the rows up to t - h and predicts
+    t; the values of that row which are known, and whose channel was observed by t - h, count.
 
     Args:
         model: trained.
-        dataset: hidden cells are not shown, and are scored like others.
+        dataset: masked values are not used, and scored like others.
         horizons: s, above 0, strictly increasing.
         targets: rows per trajectory and horizon, evenly spaced among those that can be scored.
 
@@ -285,8 +285,8 @@ def score_forecast(
         One record per horizon.
 
     Raises:
-        InputError: horizons as of `extrapolate`, no row can be scored, other channels than the
-            model's, or a model that can't be asked for times.
+        InputError: horizons as of `forecast`, no row can be scored, other channels than the
+            model's, or a model that cannot predict at any time.
     """
     dataset = transforms_of(model).apply(in_model_order(model, dataset))
     if isinstance(targets, bool) or not isinstance(targets, int) or targets < 1:
@@ -296,19 +296,19 @@ def score_forecast(
     after: list[float] = checked_horizons(horizons).tolist()
     for horizon in after:
         tasks = [task for t in dataset for task in _targets(t, horizon, targets)]
-        name = f"extrapolation, {horizon:g} s"
+        name = f"forecast, {horizon:g} s"
         sums = _sums_for(model)
         if tasks:
             pasts = replace(dataset, trajectories=tuple(past for past, _, _, _ in tasks))
             asked = [np.array([at]) for _, at, _, _ in tasks]
             predicted = predict(model, pasts, times=asked)
-            for (past, at, truth, counted), said in zip(tasks, predicted, strict=True):
-                each = {model.config.name: said.values}
+            for (past, at, truth, counted), answer in zip(tasks, predicted, strict=True):
+                each = {model.config.name: answer.values}
                 for method in FORECASTERS:
                     each[method] = forecast(past, np.array([at]), method, mean)
                 sums.add(truth, each, counted)
         results.append(sums.scores(name, FORECASTERS))
-    if not any(sum(scores.cells) for scores in results):
+    if not any(sum(scores.counts) for scores in results):
         raise InputError(
             f"no trajectory is long enough for a horizon of {after[0]:g} s after an observation; "
             "use shorter horizons or longer trajectories"
@@ -317,7 +317,7 @@ def score_forecast(
 
 
 def training_mean(model: Model) -> list[float]:
-    """The mean of each channel over the observed cells of the training part, in its unit."""
+    """The mean of each channel over the observed values of the training set, in its unit."""
     mean: list[float] = model.scaler.original(np.array(model.statistics.mean)).tolist()
     return mean
 
@@ -328,7 +328,7 @@ def _sums_for(model: Model) -> ErrorSums:
 
 
 def _gap_lengths(trajectory: Trajectory) -> NDArray[np.float64]:
-    """(rows, channels) s between the observations around a cell; 0 where a side is missing."""
+    """(rows, channels) s between the observations around a value; 0 where a side is missing."""
     times = np.where(trajectory.observed, trajectory.times[:, None], np.nan)
     before = np.fmax.accumulate(times, axis=0)
     after = np.fmin.accumulate(times[::-1], axis=0)[::-1]
@@ -340,7 +340,7 @@ _Target = tuple[Trajectory, float, NDArray[np.float64], NDArray[np.bool_]]
 
 
 def _targets(trajectory: Trajectory, horizon: float, count: int) -> list[_Target]:
-    """Pasts, times to ask for, what is true there, and which cells of it count."""
+    """Pasts, times to predict, the true values there, and which of them count."""
     times = trajectory.times
     rows = np.searchsorted(times, times - horizon * (1 - 1e-9), side="right")
     seen = np.logical_or.accumulate(trajectory.observed, axis=0)
@@ -372,8 +372,8 @@ def _aligned(lines: list[list[str]]) -> str:
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     return "\n".join(
         "  ".join(
-            cell.ljust(w) if i == 0 else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(line, widths, strict=True))
+            text.ljust(w) if i == 0 else text.rjust(w)
+            for i, (text, w) in enumerate(zip(line, widths, strict=True))
         )
         for line in lines
     )

@@ -1,31 +1,31 @@
-"""Filling from both sides: a forward model, a backward one, and a rule that joins them.
+"""Filling from both sides: a forward model, a backward model, and a rule that combines them.
 
-The backward model is trained on trajectories reversed in time, so it predicts a cell from what was
+The backward model is trained on trajectories reversed in time, so it predicts a value from what was
 observed strictly after it. Between two observations of a channel, x0 at t0 and x1 at t1, let
-s = (t - t0) / (t1 - t0), f(t) and b(t) what the two models say, and r_f = x1 - f(t1) and
-r_b = x0 - b(t0) how far off each is on arrival at the other side, which is known. The fill is
+s = (t - t0) / (t1 - t0), f(t) and b(t) the two predictions, and r_f = x1 - f(t1) and
+r_b = x0 - b(t0) their errors on arrival at the other side, which are known. The fill is
 
     (1 - s) f + s b
         + s (1 - s) (w1 (r_f + r_b) + w2 (1 - 2 s) (r_b - r_f) + w3 (f - b))
         + w4 (line - (1 - s) f - s b) + w5 (curve - (1 - s) f - s b)
 
 with the straight line through x0 and x1, and PCHIP through all that was observed of the channel.
-Its first row is the inverse-variance weighting of two predictions whose error variances grow in
-proportion to the distance from the observation each comes from. The second corrects for what both
-are seen to miss: with w1 = w2 = 1/2 and models that go on straight, the fill is the cubic Hermite
-interpolation with their slopes. The last one is the way out where models know nothing that line
-and curve do not; 1 - w4 - w5 is the share of the models (`FillRule.model_share`).
+The first line is the inverse-variance weighting of two predictions whose error variances grow in
+proportion to the distance from their observation. The second corrects the known errors: with
+w1 = w2 = 1/2 and models that continue straight, the fill is the cubic Hermite interpolation with
+their slopes. The third is for data where the line or the curve is better than the models;
+1 - w4 - w5 is the weight of the models (`FillRule.model_fraction`).
 
 After the last observation of a channel the fill is f + v (x0 - f), before the first one
-b + v (x1 - b): the model's prediction, pulled towards holding the value. A channel that is never
+b + v (x1 - b): the model's prediction, shrunk towards the observed value. A channel that is never
 observed gets the mean of both predictions.
 
-The weights are the least-squares solution on hidden cells of validation data: by length of the gap
-(outside, of the distance) and channel, held by ridge towards those of all channels together, these
-towards those of all lengths, and these towards `fill_rule.START`. The strength of the ridge is, for
-each channel, the one that does best on validation trajectories left out; where the line, PCHIP or
-holding the value does better alone, the channel gets that. Where fewer than five validation
-trajectories have such a cell, nothing is chosen outside.
+The weights are the least-squares solution on masked values of validation data: by length of the gap
+(outside, of the distance) and channel, shrunk by ridge regression towards those of all channels
+together, these towards those of all lengths, and these towards `fill_rule.START`. The strength of
+the ridge is, for each channel, the one with the least error on validation trajectories left out;
+where the line, PCHIP or the observed value alone is better, the channel gets that. Outside, fewer
+than five validation trajectories with such a value keep `START`.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from offbeat.models.model import Model
 
 @dataclass(frozen=True, eq=False)
 class TwoSided:
-    """Two models of the same channels and the rule that joins what they say.
+    """Two models of the same channels and the rule that combines their predictions.
 
     Attributes:
-        forward: predicts from what came before.
+        forward: predicts from what was observed before.
         backward: trained on trajectories reversed in time.
-        rule: chosen on validation data.
+        rule: fitted to validation data.
 
     Raises:
         InputError: the models have different channels.
@@ -77,7 +77,7 @@ def reversed_in_time(dataset: Dataset) -> Dataset:
     """Each trajectory from its end to its start, times counted from its last row.
 
     Args:
-        dataset: any trajectories; values stay as they are, those of velocities too.
+        dataset: any trajectories; values are not changed, those of velocities neither.
     """
     return replace(
         dataset,
@@ -94,15 +94,15 @@ def reversed_in_time(dataset: Dataset) -> Dataset:
 
 
 def fill_two_sided(pair: TwoSided, dataset: Dataset, *, seed: int = 0) -> list[_Array]:
-    """What the rule says of every cell that is not observed.
+    """The fill of every value that is not observed.
 
     Args:
         pair: models and rule.
-        dataset: in the order of the models' channels; hidden values are not looked at.
+        dataset: in the order of the models' channels; masked values are not used.
         seed: of the generator of self-feeding.
 
     Returns:
-        Per trajectory (rows, channels) in original units; NaN where the cell is observed.
+        Per trajectory (rows, channels) in original units; NaN where the value is observed.
     """
     filled = []
     for trajectory, sides in zip(
@@ -116,13 +116,14 @@ def fill_two_sided(pair: TwoSided, dataset: Dataset, *, seed: int = 0) -> list[_
 
 
 def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int = 0) -> FillRule:
-    """Chooses the weights of the rule, in closed form, on the hidden cells of validation data.
+    """Fits the weights of the rule, in closed form, to the masked values of validation data.
 
     Args:
         forward: trained.
         backward: trained on reversed trajectories.
-        validation: where nothing of it is hidden, 30 % of the cells of each channel are, at random.
-        seed: of that draw, and of the generator of self-feeding.
+        validation: where nothing of it is masked, 30 % of the values of each channel are, at
+            random.
+        seed: of that mask, and of the generator of self-feeding.
     """
     validation = transforms_of(forward).apply(in_model_order(forward, validation))
     if not any(masked_values(t).any() for t in validation):
@@ -141,19 +142,19 @@ def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int 
     return equations.rule()
 
 
-# --- what both sides say ----------------------------------------------------------------------
+# --- both sides -------------------------------------------------------------------------------
 
 _Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """What is known of each cell from both sides; (rows, channels) each, in original units.
+    """What is known of each value from both sides; (rows, channels) each, in original units.
 
     Attributes:
         side: index into `fill_rule.SIDES`.
-        length: s, between the observations on both sides; outside, to the only one.
-        base: what the fill is with weights 0.
+        length: s, between the observations on both sides; outside, to the nearest one.
+        base: the fill with weights 0.
         terms: (rows, channels, 5) what the weights multiply.
     """
 
@@ -180,23 +181,23 @@ def _sides_of(trajectory: Trajectory, f: _Array, b: _Array) -> _Sides:
     start, end = trajectory.times[earlier], trajectory.times[later]
     between = before & after & ~observed
 
-    seen = np.where(observed, trajectory.values, 0.0)  # a hidden value goes nowhere from here
+    seen = np.where(observed, trajectory.values, 0.0)  # masked values are not used below
     first, last = seen[earlier, at], seen[later, at]
     length = np.where(between, end - start, 1.0)
     s = np.where(between, (times - start) / length, 0.0)
-    hump = s * (1 - s)
+    weight = s * (1 - s)
     joined = (1 - s) * f + s * b
     missed_ahead, missed_back = last - f[later, at], first - b[earlier, at]
     curve = fill(trajectory, "pchip", [0.0] * trajectory.channels)
     terms = [
-        hump * (missed_ahead + missed_back),
-        hump * (1 - 2 * s) * (missed_back - missed_ahead),
-        hump * (f - b),
+        weight * (missed_ahead + missed_back),
+        weight * (1 - 2 * s) * (missed_back - missed_ahead),
+        weight * (f - b),
         (1 - s) * first + s * last - joined,
         curve - joined,
     ]
     alone = np.where(before, f, b)
-    held = np.where(before, first, last) - alone
+    towards_observed = np.where(before, first, last) - alone
     one_side = before != after
     return _Sides(
         side=np.where(one_side, np.where(before, 1, 2), 0),
@@ -206,7 +207,7 @@ def _sides_of(trajectory: Trajectory, f: _Array, b: _Array) -> _Sides:
         base=np.where(between, joined, np.where(one_side, alone, (f + b) / 2)),
         terms=np.stack(
             [
-                np.where(between, term, np.where(one_side & (k == 0), held, 0.0))
+                np.where(between, term, np.where(one_side & (k == 0), towards_observed, 0.0))
                 for k, term in enumerate(terms)
             ],
             axis=2,

@@ -50,9 +50,9 @@ def scored(
         text += ["", "hidden cells filled, RMSE in the channels' units:", imputed.table()]
         verdicts.append(imputed.verdict())
         if isinstance(model, TwoSided):
-            shares = [f"{share:.2f} up to {end:.3g} s" for end, share in model.rule.model_share]
+            shares = [f"{share:.2f} up to {end:.3g} s" for end, share in model.rule.model_fraction]
             if shares:
-                result["imputation"]["model_share"] = model.rule.model_share
+                result["imputation"]["model_fraction"] = model.rule.model_fraction
                 text.append(f"share of the models in the two-sided fill: {', '.join(shares)}")
     if horizons is not None:
         forward = model.forward if isinstance(model, TwoSided) else model

@@ -276,7 +276,8 @@ def _continuous(four: Values, observed: Mask) -> tuple[Values, Mask]:
         nearer = np.where((unit * unit[at[last]]).sum(axis=1) < 0, -1.0, 1.0)
         sign = np.where(empty, nearer * signs[last], np.where(before < 0, 1.0, signs[last]))
     # The length of a row observed in part is not known.
-    return np.where((complete | empty)[:, None], unit, four) * sign[:, None], observed
+    scaled = np.asarray(complete | empty)
+    return np.where(scaled[:, None], unit, four) * sign[:, None], observed
 
 
 def _wrapped_back(
