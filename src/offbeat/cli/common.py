@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from offbeat.data.trajectory import Dataset
 
 READER_FILE = "reader.json"
-"""Where a run keeps the options that its log was read with."""
+"""The file of a run with the options that its log was read with."""
 
 
 def say(result: Any, text: str, as_json: bool) -> None:
-    """Prints a result, for a machine or for a person."""
+    """Prints a result as JSON or as text."""
     print(json.dumps(result, indent=2) if as_json else text)
 
 
@@ -35,8 +35,8 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
 
     Args:
         data: the file.
-        reader: options of `offbeat.read`: `format`, and those of the format; those that the run was
-            trained with hold beside them, unless there is a `format`.
+        reader: options of `offbeat.read`. Those that are missing are taken from the run, unless
+            `format` is given.
         run: folder of a run.
 
     Raises:
@@ -49,9 +49,9 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
 
 
 def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str, Any]:
-    """The options given, and beside them those that the run was trained with.
+    """The options given, completed by those that the run was trained with.
 
-    Where a format is given, those of the run may be of another one, and count no more.
+    Where a format is given, the run's options are not used: they may be of another format.
 
     Raises:
         FileFormatError: those of the run are damaged.
@@ -73,8 +73,7 @@ def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) ->
     Args:
         dataset: as it was read; its labels and its clock are put back.
         answers: one trajectory per trajectory of the data set.
-        masks: add a column `name|observed` per channel: true where the value was measured, false
-            where it was filled or predicted.
+        masks: add a column `name|observed` per channel, true where the value was measured.
 
     Raises:
         InputError: a channel has the name of another column.
@@ -100,15 +99,15 @@ def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) ->
     taken = [name for name in added if name in columns]
     if taken or len(added) < answers.channels * (2 if masks else 1):
         twice = taken[0] if taken else next(n for n in answers.names if n.endswith("|observed"))
-        raise InputError(f"a channel is called {twice!r}, as another column is; rename it")
+        raise InputError(f"a channel has the name of another column, {twice!r}; rename it")
     return {**columns, **added}
 
 
 def check_out(out: Path, data: Path) -> None:
-    """Checks where a table is to be written.
+    """Checks the file of a table before anything is computed.
 
     Raises:
-        InputError: it is no .csv or .parquet file, or the data itself.
+        InputError: it is not a .csv or .parquet file, or it is the data itself.
     """
     one_of("suffix of out", out.suffix, (".csv", ".parquet"))
     if out.exists() and data.exists() and out.samefile(data):
@@ -116,10 +115,10 @@ def check_out(out: Path, data: Path) -> None:
 
 
 def check_figure(figure: Path | None) -> None:
-    """Checks where a figure is to be written, before anything is computed.
+    """Checks the file of a figure before anything is computed.
 
     Raises:
-        InputError: it is no .png, .pdf or .svg file, or can't be written there.
+        InputError: it is not a .png, .pdf or .svg file, or it can't be written.
     """
     from offbeat.files import writable
 
@@ -128,15 +127,15 @@ def check_figure(figure: Path | None) -> None:
         writable(figure)
 
 
-def drawn_channels(names: Sequence[str], asked: Sequence[str] | None) -> list[str]:
-    """The channels of a figure: those asked for, or the first four.
+def plotted_channels(names: Sequence[str], given: Sequence[str] | None) -> list[str]:
+    """The channels of a figure: those given, or the first four.
 
     Raises:
-        InputError: a channel is asked for that is not there.
+        InputError: a channel does not exist.
     """
-    if asked is None:
+    if given is None:
         return list(names[:4])
-    return [one_of("channel", name, names) for name in asked]
+    return [one_of("channel", name, names) for name in given]
 
 
 def one_trajectory(dataset: Dataset, number: int) -> int:
@@ -147,6 +146,7 @@ def one_trajectory(dataset: Dataset, number: int) -> int:
     """
     if not 0 <= number < len(dataset):
         raise InputError(
-            f"there is no trajectory {number}; the data has {len(dataset)}, counted from 0"
+            f"there is no trajectory {number}; the data has {len(dataset)}, so --trajectory goes "
+            f"from 0 to {len(dataset) - 1}"
         )
     return number

@@ -25,31 +25,32 @@ def compare_command(
     figure: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Compare trained models over repeats: which differences are real, and how large.
+    """Compare trained models over repeats: which differences are significant, and how large.
 
     For example: offbeat compare runs/gru-* runs/ode_rnn-* --baseline last_value. Runs are paired
-    by repeat: train every model on the same cuts of the data (--split.seed 0, 1, 2, ...), each run
-    in a folder of its own. Three repeats are the least, ten are better.
+    by repeat: train every model on the same splits of the data (--split.seed 0, 1, 2, ...), each
+    run in a folder of its own. At least three repeats are needed, ten are better.
 
     Args:
         runs: folders of runs, folders that hold such folders, or tables with a row per run (.csv,
             .parquet).
-        metric: honest, masked, after_first_row or published.
-        error: compare rmse or mse.
-        baseline: compare every model with this one, last_value for instance; by default every
+        metric: after_first_observation, masked, after_first_row or published.
+        error: rmse or mse.
+        baseline: compare every model with this one, last_value for example; by default every
             model with every other.
-        models: compare these alone, as in --models '[ode_rnn, ode_gru_d]'.
+        models: compare only these, as in --models ode_rnn,ode_gru_d.
         only: keep runs with these values, as in --only experiment=2,observed_fraction=0.3.
-        shared_repeats: leave out repeats that a model lacks, instead of refusing to go on.
-        alpha: level of significance.
-        confidence: of the intervals.
-        resamples: of the bootstrap.
+        shared_repeats: leave out repeats that are missing for some model; without it, a missing
+            repeat is an error.
+        alpha: significance level.
+        confidence: level of the confidence intervals.
+        resamples: number of bootstrap samples.
         seed: of the bootstrap.
-        form: what is printed, text, markdown or latex.
+        form: of what is printed: text, markdown or latex.
         out: file for the comparison: .txt, .md, .tex or .json.
         figure: file for the critical-difference diagram of three or more models: .png, .pdf or
             .svg.
-        json: print as JSON.
+        json: print the comparison as JSON.
     """
     from offbeat.comparison import compare, read_runs
     from offbeat.comparison.runs import parse_only
@@ -76,7 +77,7 @@ def compare_command(
     ranked = {c.condition: c.friedman for c in comparison.conditions if c.friedman is not None}
     if figure is not None and not ranked:
         raise InputError(
-            "a critical-difference diagram shows three or more models; leave figure out"
+            "a critical-difference diagram needs three or more models; leave out --figure"
         )
     forms = {".txt": "text", ".md": "markdown", ".tex": "latex"}
     if out is not None and out.suffix == ".json":

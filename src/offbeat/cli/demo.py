@@ -8,11 +8,11 @@ from offbeat.cli.common import say
 
 
 def demo_command(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:
-    """Run everything once, small: simulate, hide rows, train five models, score, draw.
+    """Run every step once, small: simulate, mask rows, train five models, score, plot.
 
     Args:
-        out: folder for the table, the figures, the animation and the trained models.
-        seed: of windows, hidden rows, split, weights and batches.
+        out: folder for the table, the figures, the animations and the trained models.
+        seed: of windows, masks, split, weights and batches.
         json: print the scores as JSON.
     """
     from offbeat.demo import run_demo

@@ -6,10 +6,10 @@ from offbeat.cli.common import say
 
 
 def doctor_command(json: bool = False) -> None:
-    """Tell versions, threads, and what is installed.
+    """Print versions, threads and what is installed.
 
     Args:
-        json: print as JSON.
+        json: print the findings as JSON.
     """
     from offbeat.doctor import examine
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from offbeat.cli.common import (
     check_figure,
-    drawn_channels,
     one_trajectory,
+    plotted_channels,
     read_log,
     say,
 )
@@ -33,30 +33,31 @@ def evaluate_command(
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Score a trained model beside trivial predictors.
+    """Score a trained model and simple baselines on the same values.
 
-    One step ahead, beside the last observed value. Where cells are hidden, filling them, beside
-    last value, linear interpolation and PCHIP. At horizons, if they are given, beside last value
-    and constant velocity. Errors are in the channels' units and, over all channels, in scaled ones.
+    One-step-ahead predictions are compared with the last observed value; fills of masked values
+    with the last value, linear interpolation and PCHIP; forecasts at the horizons, if any are
+    given, with the last value and constant velocity. Errors are in the channels' units and, over
+    all channels, in scaled units.
 
     Args:
         model: folder of a run or of a checkpoint.
         data: the log, of any format that Offbeat reads.
-        part: test, validation, train or all. On the data that the run was trained on, the same
-            windows, hidden rows and split are made again, and test is the default; other data can
-            only be scored as a whole.
-        observed_fraction: mask values of other data at random; this fraction stays observed.
-        mask: how: rows, values, bursts or dropout.
-        burst_rows: rows of a burst or of a silence.
-        burst_s: its length in s, instead.
-        horizons: s, to score extrapolation at: --horizons 0.5 or --horizons '[0.1, 0.5]'.
+        part: test, validation, train or all. On the data of the run, the windows, masks and split
+            of the training are made again, and test is the default; other data is scored as a
+            whole.
+        observed_fraction: fraction of the observed values of other data that is not masked.
+        mask: what is masked: rows, values, bursts or dropout.
+        burst_rows: length of a burst or of a dropout in rows.
+        burst_s: length of a burst or of a dropout in seconds, instead of in rows.
+        horizons: of the forecasts in seconds, such as --horizons 0.1,0.5.
         out: JSON file for the scores.
-        figure: .png, .pdf or .svg of one trajectory, its hidden cells and what fills them.
-        channels: to draw; by default the first four.
-        trajectory: to draw, counted from 0 within the part.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
-            own hold for what is not given, unless a format is.
-        seed: of hidden rows and generator.
+        figure: .png, .pdf or .svg of one trajectory, its masked values and the fills.
+        channels: to plot; by default the first four.
+        trajectory: to plot, counted from 0 within the part.
+        reader: how the log is read. What is not given is read as in training, unless a format is
+            given.
+        seed: of the mask, and of models with self-feeding.
         json: print the scores as JSON.
     """
     from offbeat.answers.forecast import checked_horizons
@@ -80,14 +81,14 @@ def evaluate_command(
     if own is None and part not in (None, "all"):
         raise InputError(
             f"there is no {part} part: {model} was not trained on {data}, or is not the folder of "
-            "a run; leave part out to score everything"
+            "a run; leave out --part to score all of it"
         )
     if own is not None and part != "all":
         part = part or "test"
         if observed_fraction is not None:
             raise InputError(
-                "the rows hidden in training are hidden again; leave observed_fraction out, or "
-                "give --part all"
+                "the masks of the training are made again; leave out --observed_fraction, or give "
+                "--part all"
             )
         dataset = dict(zip(("train", "validation", "test"), own, strict=True))[part]
     else:
@@ -102,7 +103,7 @@ def evaluate_command(
                 seed=seed,
             )
     forward = loaded.forward if isinstance(loaded, TwoSided) else loaded
-    chosen = drawn_channels(forward.names, channels)
+    chosen = plotted_channels(forward.names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = evaluate(forward, dataset, seed=seed)
     scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)

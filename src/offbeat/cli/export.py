@@ -9,14 +9,14 @@ from offbeat.errors import one_of
 
 
 def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False) -> None:
-    """Write one streaming step of a model for other programs, its state as inputs and outputs.
+    """Export one streaming step of a model to ONNX, its state as inputs and outputs.
 
-    The file runs without torch: offbeat.OnnxStream, offbeat stream FILE, or any ONNX runtime.
+    The file runs without torch: in offbeat.OnnxStream, offbeat stream FILE, or any ONNX runtime.
 
     Args:
         model: folder of a run or of a checkpoint.
         out: .onnx file to write.
-        to: onnx.
+        to: format of the file: onnx.
         json: print what was written as JSON.
     """
     one_of("export format", to, ("onnx",))

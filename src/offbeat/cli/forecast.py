@@ -9,8 +9,8 @@ from offbeat.cli.common import (
     answer_columns,
     check_figure,
     check_out,
-    drawn_channels,
     one_trajectory,
+    plotted_channels,
     read_log,
     say,
 )
@@ -28,21 +28,21 @@ def forecast_command(
     reader: dict[str, Any] | None = None,
     json: bool = False,
 ) -> None:
-    """Predict what comes after the last row of a log, in original units.
+    """Forecast what follows the last row of a log, in original units.
 
     Args:
         model: folder of a run or of a checkpoint.
         data: the log, of any format that Offbeat reads.
         out: .csv or .parquet file with columns trajectory, time (s), horizon (s after the last
-            row), one per channel, and one `name|observed` per channel, which is false: nothing here
-            was measured.
-        horizons: s after the last row: --horizons 0.5 or --horizons '[0.1, 0.5, 1.0]'.
+            row), one per channel, and one `name|observed` per channel, which is false: these values
+            were not measured.
+        horizons: seconds after the last row, such as --horizons 0.1,0.5,1.0.
         figure: .png, .pdf or .svg of the end of one trajectory, the forecast, last value and
             constant velocity.
-        channels: to draw; by default the first four.
-        trajectory: to draw, counted from 0.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
-            own hold for what is not given, unless a format is.
+        channels: to plot; by default the first four.
+        trajectory: to plot, counted from 0.
+        reader: how the log is read. What is not given is read as in training, unless a format is
+            given.
         json: print what was written as JSON.
     """
     import numpy as np
@@ -53,14 +53,16 @@ def forecast_command(
     from offbeat.models.checkpoint import load_model
 
     if horizons is None:
-        raise InputError("say how far to go: --horizons 0.5 or --horizons '[0.1, 0.5, 1.0]', in s")
+        raise InputError(
+            "horizons are missing; give seconds after the last row, such as --horizons 0.1,0.5,1.0"
+        )
     check_out(out, data)
     check_figure(figure)
     after = checked_horizons(horizons)
     loaded = load_model(model)
     dataset = read_log(data, reader, run=model)
     predicted = forecast(loaded, dataset, after)
-    chosen = drawn_channels(predicted.names, channels)
+    chosen = plotted_channels(predicted.names, channels)
     one_trajectory(dataset, trajectory)
     columns = answer_columns(dataset, predicted)
     names = list(columns)

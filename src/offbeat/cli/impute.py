@@ -9,8 +9,8 @@ from offbeat.cli.common import (
     answer_columns,
     check_figure,
     check_out,
-    drawn_channels,
     one_trajectory,
+    plotted_channels,
     read_log,
     say,
 )
@@ -29,23 +29,22 @@ def impute_command(
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Fill every cell of a log that was not observed, in original units.
+    """Fill every value of a log that was not observed, in original units.
 
     Args:
         model: folder of a run or of a checkpoint.
-        data: the log, of any format that Offbeat reads; empty cells are filled, and so are hidden
-            ones.
+        data: the log, of any format that Offbeat reads; missing and masked values are filled.
         out: .csv or .parquet file with columns trajectory, time (s), one per channel, and one
             `name|observed` per channel: true where the value was measured, false where it was
             filled.
-        mode: causal, from the past alone; two_sided, from both sides, which needs a run trained
-            with two_sided. By default two_sided where the run is.
+        mode: causal, from the past alone; two_sided, from past and future, which needs a run
+            trained with --two_sided. By default two_sided where the run is.
         figure: .png, .pdf or .svg of one trajectory, its fills, linear interpolation and PCHIP.
-        channels: to draw; by default the first four.
-        trajectory: to draw, counted from 0.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
-            own hold for what is not given, unless a format is.
-        seed: of the generator of self-feeding.
+        channels: to plot; by default the first four.
+        trajectory: to plot, counted from 0.
+        reader: how the log is read. What is not given is read as in training, unless a format is
+            given.
+        seed: of models with self-feeding.
         json: print what was written as JSON.
     """
     from offbeat.answers.impute import impute, load_run
@@ -58,14 +57,14 @@ def impute_command(
     loaded = load_run(model)
     dataset = read_log(data, reader, run=model)
     filled = impute(loaded, dataset, mode=mode, seed=seed)  # type: ignore[arg-type]
-    chosen = drawn_channels(filled.names, channels)
+    chosen = plotted_channels(filled.names, channels)
     one_trajectory(dataset, trajectory)
     write_table(out, answer_columns(dataset, filled))
-    cells = sum(int((~t.observed).sum()) for t in filled)
+    filled_values = sum(int((~t.observed).sum()) for t in filled)
     total = sum(t.observed.size for t in filled)
     how = str(filled.meta["filled"])
-    result = {"written": str(out), "mode": how, "filled": cells, "cells": total}
-    text = f"{out}: {cells} of {total} cells filled ({how})"
+    result = {"written": str(out), "mode": how, "filled": filled_values, "values": total}
+    text = f"{out}: {filled_values} of {total} values filled ({how})"
     if figure is not None:
         fill_figure(loaded, dataset, figure, chosen, trajectory, mode=how, seed=seed)
         result["figure"] = str(figure)

@@ -17,13 +17,13 @@ def inspect_command(
     run: Path = Path("runs/log"),
     json: bool = False,
 ) -> None:
-    """Look at a log: rates, gaps, held values, faults; and what to pass to train.
+    """Inspect a log: rates, gaps, repeated values, anomalies, and a command that trains on it.
 
     Args:
         data: the log, of any format that Offbeat reads: a file, or the folder of a data set.
         out: figure to write (.png, .pdf or .svg): when each channel was measured.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE.
-        run: folder of the run that the advice names.
+        reader: how the log is read.
+        run: folder of the run in the command that is printed.
         json: print everything as JSON.
     """
     from offbeat.data.advice import advise
@@ -34,7 +34,7 @@ def inspect_command(
     if out is not None:
         one_of("suffix of out", out.suffix.lower(), (".png", ".pdf", ".svg"))
         writable(out)
-    # What is noted aloud while reading stands in the output, too; once is enough.
+    # The warnings of the reader are part of the output.
     logging.getLogger("offbeat").addFilter(_silence)
     try:
         dataset = read(data, **(reader or {}))

@@ -23,27 +23,26 @@ def predict_command(
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Predict at the rows of a data set, one step ahead, or at asked times.
+    """Predict one step ahead at the rows of a log, or at given times.
 
-    Each prediction is made from what was observed strictly before its time, and written in the
+    Each prediction uses only what was observed strictly before its time. Predictions are in the
     original units.
 
     Args:
         model: folder of a run or of a checkpoint.
-        data: the log, of any format that Offbeat reads; a CSV has a column `time`, and empty cells
-            where nothing is known.
+        data: the log, of any format that Offbeat reads.
         out: .csv or .parquet file with columns trajectory, time (s, as times), clock_UNIT (what the
-            clock of the log shows then, in its own unit, where that differs) and one per channel.
-        times: s since the first row of each trajectory, whatever unit the log counts in: --times
-            0.25 or --times '[0.25, 0.5]'. With --reader.start clock, s on the clock of the log
-            itself; a data set that Offbeat saved keeps the times it was saved with. Later than the
-            last row is fine; before the first observation the answer is the model's start value. By
-            default the times of the rows.
-        time_unit: that a CSV counts in: s, ms, us or ns; by default what its header says, or its
-            numbers. The times asked for stay in s.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE; the run's
-            own hold for what is not given, unless a format is.
-        seed: of the generator of self-feeding.
+            clock of the log shows, in its own unit, where that differs) and one per channel.
+        times: seconds since the first row of each trajectory, in whatever unit the log counts, such
+            as --times 0.25,0.5; by default the times of the rows. With --reader.start clock,
+            seconds on the clock of the log. A data set that Offbeat saved keeps the times it was
+            saved with. Times after the last row are allowed. Before the first observation, the
+            prediction is the model's initial one.
+        time_unit: unit of the times in a CSV: s, ms, us or ns; by default found in its header or
+            its numbers. It does not change the unit of --times.
+        reader: how the log is read. What is not given is read as in training, unless a format is
+            given.
+        seed: of models with self-feeding.
         json: print what was written as JSON.
     """
     from offbeat.answers.predict import predict
@@ -53,7 +52,7 @@ def predict_command(
     check_out(out, data)
     check_seed(seed)
     if time_unit is not None and data.suffix.lower() != ".csv":
-        raise InputError(f"time_unit is an option of CSV files; {data} knows its own")
+        raise InputError(f"--time_unit is an option of CSV files; {data} has its own unit")
     if time_unit is not None:
         reader = {**reader_options(reader, model), "time_unit": time_unit}
     if isinstance(times, float):

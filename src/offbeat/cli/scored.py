@@ -35,10 +35,10 @@ def scored(
 
     Args:
         model: a trained model, or a pair.
-        dataset: hidden cells, where there are any, are imputed and scored.
+        dataset: its masked values, if any, are imputed and scored.
         evaluation: its one-step-ahead scores.
-        horizons: s; None leaves extrapolation out.
-        seed: of the generator of self-feeding.
+        horizons: s; None scores no forecasts.
+        seed: of models with self-feeding.
     """
     ahead = evaluation.in_units()
     result: dict[str, Any] = {**evaluation.to_dict(), "verdict": ahead.verdict()}
@@ -47,13 +47,13 @@ def scored(
     if any(masked_values(t).any() for t in dataset):
         imputed = score_imputation(model, dataset, seed=seed)
         result["imputation"] = imputed.to_dict()
-        text += ["", "hidden cells filled, RMSE in the channels' units:", imputed.table()]
+        text += ["", "masked values filled, RMSE in the channels' units:", imputed.table()]
         verdicts.append(imputed.verdict())
         if isinstance(model, TwoSided):
-            shares = [f"{share:.2f} up to {end:.3g} s" for end, share in model.rule.model_fraction]
-            if shares:
+            fractions = [f"{part:.2f} up to {end:.3g} s" for end, part in model.rule.model_fraction]
+            if fractions:
                 result["imputation"]["model_fraction"] = model.rule.model_fraction
-                text.append(f"share of the models in the two-sided fill: {', '.join(shares)}")
+                text.append(f"weight of the models in the two-sided fill: {', '.join(fractions)}")
     if horizons is not None:
         forward = model.forward if isinstance(model, TwoSided) else model
         ahead_of = score_forecast(forward, dataset, horizons)
@@ -76,16 +76,16 @@ def fill_figure(
     mode: str | None = None,
     seed: int = 0,
 ) -> None:
-    """Draws one trajectory, its hidden cells, the fill and what interpolation would put there.
+    """Plots one trajectory: its masked values, the model's fill and interpolations.
 
     Args:
         model: a trained model, or a pair.
-        dataset: hidden cells are drawn as truth.
+        dataset: its masked values are plotted as the truth.
         path: the figure.
-        channels: to draw.
+        channels: to plot.
         number: of the trajectory.
         mode: as of `impute`.
-        seed: of the generator of self-feeding.
+        seed: of models with self-feeding.
     """
     forward = model.forward if isinstance(model, TwoSided) else model
     truth = dataset.select(forward.names)[number]
@@ -105,14 +105,14 @@ def forecast_figure(
     channels: Sequence[str],
     number: int,
 ) -> None:
-    """Draws the end of one trajectory, the forecast, and what trivial predictors say.
+    """Plots the end of one trajectory, the forecast, and those of the baselines.
 
     Args:
         model: trained.
         dataset: as it was read.
         horizons: s.
         path: the figure.
-        channels: to draw.
+        channels: to plot.
         number: of the trajectory.
     """
     truth = dataset.select(model.names)[number]

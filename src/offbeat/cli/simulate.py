@@ -17,15 +17,15 @@ def simulate_command(
     threads: int | None = None,
     json: bool = False,
 ) -> None:
-    """Simulate a robot falling without control, and write a data set.
+    """Simulate a robot that falls without control, and write a data set.
 
     Args:
         out: Parquet file to write.
         robot: hopper or walker.
         n_trajectories: how many, each from its own random state.
         rows: rows per trajectory; one per physics step, 5 ms for the hopper.
-        seed: of the initial states; 123 is the draw of the thesis' protocol.
-        threads: of the simulation; all cores by default. They do not change the result.
+        seed: of the initial states; the thesis' protocol uses 123.
+        threads: of the simulation; all cores by default. The result does not depend on it.
         json: print what was written as JSON.
     """
     from offbeat.data.simulate import simulate

@@ -17,22 +17,23 @@ def stream_command(
     seed: int = 0,
     stats: bool = False,
 ) -> None:
-    """Run a model live: JSON lines on standard input, an answer to each on standard output.
+    """Run a model live: reads JSON lines from standard input, writes an answer for each.
 
-    {"t": 0.25, "values": {"knee": 0.3}} is answered with its outcome and with a prediction.
-    Channels that are null or left out were not measured. {"predict": 0.3} predicts and consumes
-    nothing; {"reset": true}, {"counters": true}, {"state": true} and {"restore": STATE} do what
-    they say. A bad line is answered with {"error": ...}. It ends with the input or on SIGTERM,
-    after answering all that had arrived.
+    The answer to {"t": 0.25, "values": {"knee": 0.3}} says what was done with the message and holds
+    a prediction. Channels that are null or left out were not measured. {"predict": 0.3} predicts
+    without an observation; {"reset": true}, {"counters": true}, {"state": true} and
+    {"restore": STATE} are further requests. The answer to a bad line is {"error": ...}. The command
+    ends at the end of the input or on SIGTERM, once every line that had arrived is answered.
 
     Args:
         model: folder of a run or of a checkpoint, or a file that `offbeat export` wrote.
-        options: what to do with messages that are late, repeated, stale or on another clock.
-        horizon_s: predict so many seconds after the newest row; by default each row is predicted
-            at its own time, before its values are looked at.
+        options: what is done with messages that are late, repeated, stale or on another clock.
+        horizon_s: predict this many seconds after the newest row; by default each row is predicted
+            at its own time, before its values are used.
         time_unit: of all times: s, ms, us or ns. Integers are exact.
-        state: JSON file with the state of a stream: taken up if it is there, written at the end.
-        seed: of the generator of self-feeding.
+        state: JSON file with the state of a stream: restored if the file exists, written at the
+            end.
+        seed: of models with self-feeding.
         stats: print latencies and counters as JSON on standard error at the end.
     """
     import json
@@ -67,19 +68,19 @@ def stream_command(
         try:
             stream.restore(json.loads(state.read_text(encoding="utf-8")))
         except ValueError as error:
-            raise FileFormatError(f"{state} can't be taken up: {error}") from None
+            raise FileFormatError(f"{state} can't be restored: {error}") from None
     session, latency = LineSession(stream, horizon_s=horizon_s), Latency()
 
     def answer(line: bytes) -> bytes:
         began = time.perf_counter_ns()
-        said = session.answer(line)
+        reply = session.answer(line)
         latency.add(time.perf_counter_ns() - began)
-        return said
+        return reply
 
     sys.stdout.flush()
-    heard = serve(answer, session.refuse, source=sys.stdin.fileno(), sink=sys.stdout.fileno())
-    if not heard:
-        # The interpreter would try to flush a pipe that nobody reads.
+    complete = serve(answer, session.refuse, source=sys.stdin.fileno(), sink=sys.stdout.fileno())
+    if not complete:
+        # The interpreter would try to flush a pipe that is closed.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
@@ -89,7 +90,7 @@ def stream_command(
         counted = {
             "lines": session.lines,
             "bad_lines": session.bad_lines,
-            "answers_heard_to_the_end": heard,
+            "answers_heard_to_the_end": complete,
             "latency": latency.to_dict(),
             "counters": stream.counters.to_dict() | {"pending": stream.pending},
         }

@@ -40,10 +40,10 @@ def train_command(
         model: what the model consists of; only the name is needed.
         training: epochs, optimizer and the rest, where they differ from the model's recipe.
         split: windows, masked values, and the split into training, validation and test part.
-        scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
+        scaler: standardise, min_max, divide_by_max or identity, fitted on the training part.
         two_sided: train a second model on reversed trajectories as well, so that impute can fill
             from both sides; it is saved in the folder backward of the run.
-        reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE.
+        reader: how the log is read; the run keeps these options for the other commands.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
         json: print the scores as JSON.
