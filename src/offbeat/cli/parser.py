@@ -187,16 +187,16 @@ class CommandParser(ArgumentParser):
         for option in self._option_string_actions:
             if option.startswith("--") and not set("=+") & set(option):
                 named.setdefault(option.lstrip("-").split(".")[-1], set()).add(option)
+        start = r"(?<![\w.\-'\"|/])"
         for name, options in named.items():
             if len(options) > 1:
                 continue
             (option,) = options
-            message = re.sub(rf"(?<![\w.\-'\"]){name}=(?=[\w'\"])", f"{option} ", message)
-            message = re.sub(rf"(?<![\w.\-'\"]){name}=", option, message)
-            exact = (
-                rf"(?<![\w.\-'\"|]){name}(?![\w.='\"|])" if "_" in name else rf"^{name}(?= must)"
-            )
-            message = re.sub(exact, option, message)
+            message = re.sub(rf"{start}{name}='([\w.]+)'", rf"{option} \1", message)
+            message = re.sub(rf"{start}{name}=(?=[\w'\"])", f"{option} ", message)
+            message = re.sub(rf"{start}{name}=", option, message)
+            alone = rf"{start}{name}(?![\w.='\"|/])" if "_" in name else f"^{name}(?= must)"
+            message = re.sub(alone, option, message)
         return message
 
 
