@@ -1,4 +1,4 @@
-// Arguments from Python, checked: arrays, sizes, a spec: part of module.cpp.
+// Checks of the arguments from Python: arrays, sizes, specs. Part of module.cpp.
 
 template <class T>
 using Array = nb::ndarray<T, nb::device::cpu>;
@@ -169,7 +169,7 @@ Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_in
   return s;
 }
 
-// Steps of the solver over a gap, at most.
+// The number of solver steps over a gap.
 template <class T>
 int steps_of_gap(const Spec& s, T gap) {
   if (!(s.max_step > 0) || !s.field.layers || !(gap > 0)) return s.steps;

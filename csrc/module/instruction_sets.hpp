@@ -1,4 +1,4 @@
-// The bodies that this processor can run: part of module.cpp.
+// The instruction sets that this processor can run: part of module.cpp.
 
 std::vector<const InstructionSet*> runnable() {
   std::vector<const InstructionSet*> found;
@@ -21,9 +21,9 @@ const std::vector<const InstructionSet*>& instruction_sets() {
 
 const InstructionSet& find_instruction_set(const std::string& name) {
   std::string names;
-  for (const InstructionSet* b : instruction_sets()) {
-    if (name == b->name) return *b;
-    names += std::string(names.empty() ? "" : ", ") + b->name;
+  for (const InstructionSet* set : instruction_sets()) {
+    if (name == set->name) return *set;
+    names += std::string(names.empty() ? "" : ", ") + set->name;
   }
   refuse("this processor does not run the instruction set '" + name + "', it runs " + names);
 }

@@ -153,7 +153,7 @@ void bind(nb::module_& m, const char* suffix) {
 
 NB_MODULE(_cpu, m) {
   using namespace offbeat;
-  nb::set_leak_warnings(false);  // caches of specs live until the interpreter ends
+  nb::set_leak_warnings(false);  // cached specs live as long as the interpreter
   nb::register_exception_translator([](const std::exception_ptr& error, void*) {
     try {
       std::rethrow_exception(error);
@@ -165,7 +165,7 @@ NB_MODULE(_cpu, m) {
   m.doc() = "The compiled backend of the scan; offbeat.kernels.cpu calls it.";
   m.def("instruction_sets", [] {
     std::vector<std::string> names;
-    for (const InstructionSet* b : instruction_sets()) names.emplace_back(b->name);
+    for (const InstructionSet* set : instruction_sets()) names.emplace_back(set->name);
     return names;
   });
   m.def("width", [](const std::string& set) { return find_instruction_set(set).f32.width; });

@@ -180,7 +180,7 @@ class StreamEngine {
     row.use_prediction = use_prediction;
     row.state = now_.state.data(), row.before = before_.data(), row.after = after_.data();
     row.scratch = scratch_.get();
-    steps_of_gap(spec_, row.gap);  // raises where there are too many
+    steps_of_gap(spec_, row.gap);  // refuses a gap of too many
     kernels_.stream_row(row);
   }
 

@@ -1,10 +1,10 @@
-// Affine maps of a block or of a stream, and activations: part of Scan<T> (scan.hpp).
+// Affine maps and activations, of a block and of a stream: part of Scan<T> (scan.hpp).
 
-// What becomes of a product before it is stored, at an offset of its result.
+// Applied to each vector of a product before it is stored; the argument is its offset.
 struct Plain {
   INLINE V operator()(V a, int64_t) const { return a; }
 };
-struct TimesTanhSlope {  // that follows from the value of tanh
+struct TimesTanhSlope {  // the derivative of tanh, computed from its value
   const T* value;
   INLINE V operator()(V a, int64_t i) const {
     const V y = load<T>(value + i);
@@ -79,10 +79,10 @@ static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x,
                                      y, int64_t(o) * VW, finish);
 }
 
-// A policy of lanes: a block of NV vectors of lanes, or the one lane of a stream.
+// How lanes are laid out: `Many` is a block of NV vectors of lanes, `One` the one lane of a stream.
 template <int NV>
 struct Many {
-  static constexpr int W = NV * VW, N = NV;  // distance of units, vectors of a per-lane quantity
+  static constexpr int W = NV * VW, N = NV;  // stride of a unit, vectors of a per-lane quantity
   static constexpr bool ONE = false;
   static int pad(int n) { return n; }
   template <bool ACCUMULATE>
@@ -95,7 +95,7 @@ struct Many {
   static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
     product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x, Plain{});
   }
-  // The same, times the slope of tanh where its value is `value`.
+  // The same, times the derivative of tanh where the value of tanh is `value`.
   static NOINLINE void through_tanh(const Matrix& m, const T* packed, int lanes, const T* y,
                                     const T* value, T* x) {
     product<false>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
@@ -139,7 +139,7 @@ struct One {
     const int first = m.in_split, second = m.in - first;
     const T* x2 = x + pad(first);
     int o = 0;
-    // Several panels side by side hide the latency of a sum.
+    // Several panels at a time hide the latency of a sum.
     for (; o + 4 * VW <= m.padded_out; o += 4 * VW)
       panels<4, ACCUMULATE>(w + int64_t(o) * m.in, bias, o, first, second, m.in, x, x2, y);
     for (; o + 2 * VW <= m.padded_out; o += 2 * VW)

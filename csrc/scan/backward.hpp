@@ -1,10 +1,10 @@
 // The backward pass of a block: part of Scan<T> (scan.hpp).
 //
-// Rows go by in groups, last first. The tape of a group is what the forward pass kept, or is
-// computed again. What reaches each matrix in a group is added to its gradient in one go, so that
-// the gradient's own traffic through the cache is paid once per group.
+// Rows are processed in groups, last first. The tape of a group was stored by the forward pass, or
+// is recomputed here. The products of a group are added to the gradient of each matrix together, so
+// that the gradient moves through the cache once per group.
 
-// Products that wait to be added: to_out (out, lane) times x (in, lane), summed over lanes.
+// Products that are not added yet: to_out (out, lane) times x (in, lane), summed over lanes.
 static constexpr int MAX_PAIRS = 128, PAIRS_AT_ONCE = 8;
 struct Pairs {
   int count[M_END] = {};
@@ -61,7 +61,7 @@ static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, int lanes, con
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
     for (int e = 0; e < n; ++e)
       transpose(x[first + e], m.in, in, W, lanes, xt + int64_t(e) * lanes * in);
-    for (int i = 0; i < in;) {  // strips of three vectors, the rest in pairs where it can be
+    for (int i = 0; i < in;) {  // strips of three vectors, then of two or one
       const int left = (in - i) / VW;
       if (left == 3 || left > 4) {
         outer_strip<4, 3>(n, W, lanes, to_out + first, m.out, xt, in, i, sum);
@@ -93,7 +93,7 @@ static void flush(const Map& map, Pairs& pairs, int W, int lanes, T* sums, T* xt
   }
 }
 
-// Where the gradients of a row's affine maps lie until they are added; offsets in units.
+// Offsets, in units, of the gradients of a row's affine maps until they are added.
 struct GradientLayout {
   int64_t gate, inner, start, end, decoder, field, field_size, size;
 };
@@ -133,8 +133,8 @@ struct Back {
   }
 };
 
-// From the gradient of a perceptron's result, which already lies at the end of `kept_gradients`, to
-// the one of its argument.
+// Computes the gradient of a perceptron's argument from the gradient of its result, which the
+// caller has stored at the end of `kept_gradients`.
 template <class P>
 static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int first, const Net& n,
                                        const T* x, const T* kept, T* kept_gradients, T* to_x) {
@@ -160,7 +160,8 @@ static NOINLINE void evaluate_backward(Back<P>& k, const Perceptron& shape, int 
   }
 }
 
-// `g` comes as the gradient of the state after the row and leaves as the one before the gap.
+// `g` is the gradient of the state after the row, and becomes the gradient of the state before the
+// gap.
 template <class P>
 static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* tape, T* slot, T* g,
                                   const Job<T>& job, const Block& b, int row) {
@@ -197,11 +198,11 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
   const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
   T* to_start = to(k.places.start);
   T* to_end = to(k.places.end);
-  T* to_applied_before = k.z + int64_t(widest<P>(s)) * W;
+  T* to_before = k.z + int64_t(widest<P>(s)) * W;
   if (d.F) {
     zero(to_start, int64_t(d.H) * W);
     zero(to_end, int64_t(d.H) * W);
-    zero(to_applied_before, int64_t(d.H) * W);
+    zero(to_before, int64_t(d.H) * W);
   }
   for (int q = most - 1; q >= 0; --q) {
     const T* step = at(l.step) + int64_t(q) * l.step_size * W;
@@ -217,38 +218,26 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
     const T* previous = applied - l.step_size * W;
     P::each(d.H, [&](int64_t i, int lane) {
       const V first = load<T>(at(l.start) + i), last = load<T>(at(l.end) + i);
-      const V fresh = load<T>(f.updated + lane);
-      V applied_before;
-      if (q)
-        applied_before = load<T>(previous + i);
-      else if (s.decay_rows != CONTINUOUS)
-        applied_before = splat(0);
-      else
-        applied_before = fresh != T(0) ? splat(0) : clip(first);
-      V fraction = splat(1), exponent = last;
-      if (!one_shot) {
-        fraction = T(q + 1) / load<T>(steps + lane);
-        fraction = fraction > T(1) ? splat(1) : fraction;
-        exponent = fma(fraction, last - first, first);
-      }
-      const V bounded = clip(exponent), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
+      const V updated = load<T>(f.updated + lane);
+      const Exponent e = exponent(s, q, one_shot, first, last, updated, steps + lane, previous + i);
+      const V bounded = clip(e.reached), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
       store<T>(gh + i, gradient * gamma);
       V to_growth = -gamma * gradient * load<T>(arrived + i);
-      if (s.field.layers) to_growth = bounded - applied_before >= T(0) ? to_growth : splat(0);
-      // The larger of the two is what the state carries on; a tie shares the gradient.
-      const V state_gradients = load<T>(to_applied_before + i);
-      const V fraction_exponent = bounded > applied_before    ? splat(1)
-                                  : bounded == applied_before ? splat(T(0.5))
-                                                              : splat(0);
-      const V to_bounded = to_growth + state_gradients * fraction_exponent;
-      const V to_previous = state_gradients * (1 - fraction_exponent) - to_growth;
-      const V to_exponent = to_bounded * inside(exponent);
-      V start = load<T>(to_start + i) + (1 - fraction) * to_exponent;
-      store<T>(to_end + i, load<T>(to_end + i) + fraction * to_exponent);
+      if (s.field.layers) to_growth = bounded - e.before >= T(0) ? to_growth : splat(0);
+      // The applied exponent is the larger of the two; a tie splits the gradient.
+      const V to_applied = load<T>(to_before + i);
+      const V slope = bounded > e.before    ? splat(1)
+                      : bounded == e.before ? splat(T(0.5))
+                                            : splat(0);
+      const V to_bounded = to_growth + to_applied * slope;
+      const V to_previous = to_applied * (1 - slope) - to_growth;
+      const V to_reached = to_bounded * inside(e.reached);
+      V start = load<T>(to_start + i) + (1 - e.fraction) * to_reached;
+      store<T>(to_end + i, load<T>(to_end + i) + e.fraction * to_reached);
       if (q == 0 && s.decay_rows == CONTINUOUS)
-        start = start + (fresh != T(0) ? splat(0) : to_previous * inside(first));
+        start = start + (updated != T(0) ? splat(0) : to_previous * inside(first));
       store<T>(to_start + i, start);
-      store<T>(to_applied_before + i, to_previous);
+      store<T>(to_before + i, to_previous);
     });
   }
   if (d.F) {
@@ -322,7 +311,7 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
   });
 }
 
-// Fills the gradient of the gates; turns those of h and of the memory into the ones before.
+// Computes the gradient of the gates; `gh` and `gc` become the gradients before the update.
 template <class P>
 static NOINLINE void cell_backward(Back<P>& k, const RowInputs<P>& f, const T* tape, T* slot, T* gh,
                                    T* gc) {
@@ -514,7 +503,7 @@ static void reduce_lanes(const T* sums, int units, T* flat) {
   }
 }
 
-// GradientLayout are added in their order, whoever filled them.
+// The slots are added in their order, whichever thread filled them.
 static void reduce(const Spec& s, const T* sums, int n, T* flat) {
   const Map p = map(s);
   zero(flat, p.flat);

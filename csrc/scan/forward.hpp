@@ -29,6 +29,26 @@ static int steps_of(const Spec& s, const T* gap, T* steps) {
   return most;
 }
 
+// The exponent of a decay at a step of the solver: applied before the step, reached at its end, and
+// the fraction of the gap at its end.
+struct Exponent {
+  V before, reached, fraction;
+};
+static INLINE Exponent exponent(const Spec& s, int step, bool one_shot, V first, V last, V updated,
+                                const T* steps, const T* previous) {
+  Exponent e{splat(0), last, splat(1)};
+  if (step)
+    e.before = load<T>(previous);
+  else if (s.decay_rows == CONTINUOUS)
+    e.before = updated != T(0) ? splat(0) : clip(first);
+  if (!one_shot) {
+    e.fraction = T(step + 1) / load<T>(steps);
+    e.fraction = e.fraction > T(1) ? splat(1) : e.fraction;
+    e.reached = fma(e.fraction, last - first, first);
+  }
+  return e;
+}
+
 template <class P>
 static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* state, T* tape) {
   const Spec& s = c.s;
@@ -38,7 +58,7 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   auto at = [&](int64_t units) { return tape + units * W; };
   T* h = state + l.h_at * W;
   T* memory = state + l.c_at * W;
-  T* z = c.work;  // the widest layer fits
+  T* z = c.work;  // as wide as the widest layer
 
   // The cell's input: observed values, faded values, or the decoded state before the gap.
   T* u = at(l.u);
@@ -94,27 +114,17 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
       const T* previous = applied - l.step_size * W;
       P::each(d.H, [&](int64_t i, int lane) {
         const V first = load<T>(start + i), last = load<T>(end + i);
-        V applied_before;
-        if (k)
-          applied_before = load<T>(previous + i);
-        else if (s.decay_rows != CONTINUOUS)
-          applied_before = splat(0);
-        else
-          applied_before = load<T>(f.updated + lane) != T(0) ? splat(0) : clip(first);
-        V exponent = last;
-        if (!one_shot) {
-          V fraction = T(k + 1) / load<T>(steps + lane);
-          fraction = fraction > T(1) ? splat(1) : fraction;
-          exponent = fma(fraction, last - first, first);
-        }
-        V growth = clip(exponent) - applied_before;
+        const V updated = load<T>(f.updated + lane);
+        const Exponent e =
+            exponent(s, k, one_shot, first, last, updated, steps + lane, previous + i);
+        V growth = clip(e.reached) - e.before;
         if (s.field.layers) growth = growth < T(0) ? splat(0) : growth;
         const V gamma = exp_(-growth), before = load<T>(h + i);
         store<T>(arrived + i, before);
         store<T>(factor + i, gamma);
         store<T>(h + i, before * gamma);
-        const V bounded = clip(exponent);
-        store<T>(applied + i, bounded > applied_before ? bounded : applied_before);
+        const V bounded = clip(e.reached);
+        store<T>(applied + i, bounded > e.before ? bounded : e.before);
       });
     }
     if (!s.field.layers) break;
@@ -144,7 +154,8 @@ static INLINE void copy(int units, const T* from, T* to) {
   P::each(units, [&](int64_t i, int) { store<T>(to + i, load<T>(from + i)); });
 }
 
-// One step of each lane's own span; the stages and their layers stay on the tape.
+// One step of the solver, of length `span` in each lane. The tape keeps the stages and their
+// layers.
 template <class P>
 static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T* stages, T* z) {
   const Spec& s = c.s;
@@ -176,7 +187,7 @@ static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T
   });
 }
 
-// `gate` holds the input's part and becomes the activated gates.
+// `gate` is the projection of the inputs, and becomes the activated gates.
 template <class P>
 static NOINLINE void cell_forward(const Context<P>& c, const RowInputs<P>& f, T* h, T* memory,
                                   T* gate, T* inner) {
@@ -216,7 +227,7 @@ static NOINLINE void cell_forward(const Context<P>& c, const RowInputs<P>& f, T*
     });
     return;
   }
-  // equations 20-23, and 29-32 with the gates of GRU-D
+  // equations 20-23, and 29-32 for the gates of GRU-D
   P::template affine<true>(c.map.m[M_REC], c.packed, c.lanes, h, gate);
   P::each(d.H, [&](int64_t i, int) {
     const V r = sigmoid_(load<T>(gate + n + i));

@@ -1,7 +1,7 @@
 // The step inputs of a row, gathered for the lanes of a block, and the layout of the tape: part of
 // Scan<T> (scan.hpp).
 
-// --- between [lane][unit], as callers have it, and [unit][lane] ---------------------------------
+// --- from [lane][unit], the layout of the arguments, to [unit][lane] and back -------------------
 
 // out[unit * W + lane] = lanes[lane][unit]
 static NOINLINE void lanes_to_units(const T* const* lanes, int units, int W, T* out) {
@@ -37,7 +37,7 @@ static NOINLINE void units_to_lanes(const T* x, int units, int n, int W, T* cons
 
 // --- the tape of a row ----------------------------------------------------------------------
 
-// Offsets in units, each to be multiplied by the policy's W. `Net` is one evaluation.
+// Offsets in units, to be multiplied by P::W. `Net` is one evaluation of a perceptron.
 struct Net {
   int64_t value[MAX_LAYERS], slope[MAX_LAYERS], size;
 };
@@ -98,7 +98,7 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
   l.size = at + step * max_steps;
   return l;
 }
-// Every policy of blocks has the same layout in units.
+// The layout in units is the same for one and two vectors.
 static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
   return layout<Many<1>>(s, dims(s), max_steps).size * VW * vectors;
 }
@@ -201,6 +201,6 @@ struct Context {
   const T* packed;
   const T* input_decay;  // weights, then biases
   Layout<P> l;
-  T* work;           // slopes of the stages, and other scratch
-  int lanes = P::W;  // that there are; the others are padding
+  T* work;           // scratch: a layer, then the slopes of the stages
+  int lanes = P::W;  // lanes in use; the others are padding
 };

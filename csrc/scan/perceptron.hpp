@@ -1,5 +1,4 @@
-// A perceptron over many rows, forward and backward: part of Scan<T> (scan.hpp). The decoder is
-// one.
+// A perceptron over many rows, forward and backward: part of Scan<T> (scan.hpp).
 
 static Map perceptron_map(const Perceptron& shape) {
   Spec s{};

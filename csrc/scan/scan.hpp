@@ -1,7 +1,6 @@
 // The scan for one instruction set: the loop over rows, forward and backward.
 //
-//     decay -> dynamics over the gap -> (decode: the state before the row) -> cell at an
-//     observation
+//     decay -> dynamics over the gap -> (the state before the row) -> cell at an observation
 //
 // Included inside an anonymous namespace, once per instruction set. Activations are stored as
 // [unit][lane]. Weights are packed in panels of TILE outputs, [panel][input][output in panel], and

@@ -42,8 +42,8 @@ static void stream_row(const StreamRow<T>& row) {
   f.use_prediction = row.use_prediction && s.decoder.layers;
 
   Layout<One> l = layout<One>(s, d, 1);
-  // Later steps reuse the place of the first one, but for what a decay has applied so far: with
-  // `step_size` 0 they find it where the step before left it.
+  // All steps use the memory of the first. With `step_size` 0, a step finds the exponent that the
+  // step before has applied at its own place.
   l.step_size = 0;
   T* state = take(l.state + VW);
   T* tape = take(l.size + VW);

@@ -24,7 +24,7 @@ typedef Lanes<float>::V VF;
 typedef Lanes<double>::V VD;
 
 #define INLINE inline __attribute__((always_inline))
-#define NOINLINE __attribute__((noinline))  // large, called from many places: one copy is enough
+#define NOINLINE __attribute__((noinline))  // large functions with many callers
 
 template <class T>
 INLINE typename Lanes<T>::V load(const T* p) {
@@ -57,7 +57,7 @@ INLINE VF fma(VF a, VF b, VF c) { return a * b + c; }
 INLINE VD fma(VD a, VD b, VD c) { return a * b + c; }
 #endif
 
-// Four floats, for what is too narrow for a vector.
+// Four floats, for outputs that do not fill a vector.
 typedef float F4 __attribute__((vector_size(16), may_alias));
 typedef float U4 __attribute__((vector_size(16), aligned(4), may_alias));
 INLINE F4 load_four(const float* p) { return *reinterpret_cast<const U4*>(p); }
@@ -71,7 +71,7 @@ INLINE F4 fma_four(F4 a, F4 b, F4 c) {
 INLINE F4 fma_four(F4 a, F4 b, F4 c) { return a * b + c; }
 #endif
 
-// NaN stays NaN: where one operand is, the processor's minimum and maximum give the second one.
+// NaN stays NaN: the processor's minimum and maximum return their second operand if either is NaN.
 #if defined(__AVX512F__) && VECTOR_BYTES == 64
 INLINE VF at_most(VF x, float b) { return (VF)_mm512_min_ps((__m512)broadcast(b), (__m512)x); }
 INLINE VF at_least(VF x, float b) { return (VF)_mm512_max_ps((__m512)broadcast(b), (__m512)x); }
@@ -83,8 +83,8 @@ INLINE VF at_most(VF x, float bound) { return x > bound ? broadcast(bound) : x; 
 INLINE VF at_least(VF x, float bound) { return x < bound ? broadcast(bound) : x; }
 #endif
 
-// e^x to about one unit in the last place: x = n ln 2 + r, a polynomial in r, n into the exponent.
-// Coefficients: least relative error on |r| <= ln(2) / 2.
+// e^x to about one unit in the last place: x = n ln 2 + r, e^r by a polynomial, 2^n by the bits of
+// the exponent. The coefficients minimise the relative error on |r| <= ln(2) / 2.
 INLINE VF exp_(VF x) {
   typedef Lanes<float>::I I;
   const VF clipped = at_least(at_most(x, 88.3762626647949f), -87.0f);
@@ -103,7 +103,7 @@ INLINE VF exp_(VF x) {
   return x == x ? scaled : x;
 }
 
-// tanh by a rational function of least relative error on |x| <= 9.
+// tanh by a rational function whose coefficients minimise the relative error on |x| <= 9.
 INLINE VF tanh_(VF x) {
   const VF c = at_least(at_most(x, 9.0f), -9.0f);
   const VF s = c * c;
@@ -121,7 +121,7 @@ INLINE VF tanh_(VF x) {
   return c * p / q;
 }
 
-// Doubles serve tests: the C library's functions, lane by lane.
+// Double precision is for tests: the functions of the C library, lane by lane.
 INLINE VD exp_(VD x) {
   for (int i = 0; i < Lanes<double>::W; ++i) x[i] = ::exp(x[i]);
   return x;
@@ -136,7 +136,7 @@ INLINE V sigmoid_(V x) {
   return 1 / (1 + exp_(-x));
 }
 
-// Turns 8 rows of 8 floats at `x(i)` into 8 rows at `y(i)`.
+// Transposes the 8 rows of 8 floats at `x(i)` into `y(i)`.
 #if defined(__AVX__)
 #define FAST_TRANSPOSE 1
 template <class X, class Y>

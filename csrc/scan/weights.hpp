@@ -20,7 +20,7 @@ static Dims dims(const Spec& s) {
 }
 static int up(int n, int m) { return (n + m - 1) / m * m; }
 
-// The matrices in the order of the flat buffer (offbeat.kernels.spec.ScanWeights.packed).
+// The matrices in the order of the flat buffer of all weights (cpu.py).
 enum {
   M_IN,
   M_REC,
@@ -34,14 +34,14 @@ enum {
 
 struct Matrix {
   int out = 0, in = 0;
-  int64_t weight = -1, bias = -1;  // in the flat buffer; -1: there is none
+  int64_t weight = -1, bias = -1;  // in the flat buffer; -1: none
   bool backward = false;
   int backward_in = 0;                                  // leading inputs that need a gradient
   int64_t panels = 0, transposed = 0, packed_bias = 0;  // in the packed buffer of batches
   int64_t sum = 0, bias_sum = 0;                        // in the sums of a slot
-  int split[4] = {};  // output rows begin anew at these (streams pad each segment)
+  int split[4] = {};  // segments of the outputs, which streams pad one by one
   int splits = 1;
-  int in_split = 0;  // first part of the inputs (streams pad it)
+  int in_split = 0;  // first segment of the inputs, which streams pad
   int64_t stream_panels = 0, stream_bias = 0;
   int padded_out = 0;
 };
