@@ -14,7 +14,7 @@ import torch
 
 import offbeat as ob
 from offbeat import kernels
-from thesis.provenance import commit, cpu
+from offbeat.sweeps.provenance import commit, cpu
 
 
 def synthetic(

@@ -27,7 +27,7 @@ import pyarrow.csv as pv
 import pyarrow.parquet as pq
 
 from offbeat.data.readers import read
-from thesis.provenance import commit, cpu
+from offbeat.sweeps.provenance import commit, cpu
 
 
 def write(folder: Path, rows: int, channels: int) -> dict[str, Path]:

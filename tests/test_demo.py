@@ -14,6 +14,7 @@ from offbeat.errors import InputError, MissingExtraError, OffbeatError
 from offbeat.models.zoo import THESIS_MODELS
 from offbeat.plots import animation
 from offbeat.sweeps import side_by_side
+from offbeat.sweeps.engines.base import Ending
 
 TINY = {"n_trajectories": 40, "epochs": 1, "anchored_epochs": 2, "progress": False}
 PREDICTORS = {*THESIS_MODELS, ANCHORED, "last_value"}
@@ -168,11 +169,9 @@ def test_an_error_in_a_process_that_trains_is_raised_here(copy):
 
 
 def test_a_process_that_was_killed_is_reported_with_what_to_do():
-    receiver, sender = multiprocessing.Pipe(duplex=False)
-    sender.close()
-    killed = SimpleNamespace(join=lambda: None, exitcode=-9)
-    with pytest.raises(OffbeatError, match=r"trained 'gru' ended with exit code -9; run the same"):
-        side_by_side._collect(SimpleNamespace(name="gru"), killed, receiver)
+    lost = Ending(SimpleNamespace(name="gru"), lost=True)
+    with pytest.raises(OffbeatError, match="trained 'gru' was ended; run the same again"):
+        side_by_side.raise_failure(lost)
 
 
 def test_other_settings_in_the_same_folder_change_nothing(copy):

@@ -147,7 +147,7 @@ class Protocol:
         fine = all(0 < fraction <= 1 for fraction in self.observed_fractions)
         if not percents or not fine or len(set(percents)) != len(percents):
             raise InputError(
-                "observed_fractions must be above 0 and at most 1 that differ by a percent "
+                "observed_fractions must be above 0 and at most 1, and differ by a percent "
                 f"or more, got {self.observed_fractions}"
             )
         if not 1 <= self.repeats <= 100:

@@ -13,11 +13,12 @@ from typing import Any
 
 from offbeat.data.simulate import available_cores
 from offbeat.files import atomic_folder, write_json
-from thesis.execute import TRAINING
+from offbeat.sweeps.record import SESSIONS
+from offbeat.sweeps.session import read_sessions
+from offbeat.sweeps.task import TRAINING
 from thesis.protocol import Protocol
-from thesis.provenance import Provenance
-from thesis.record import GROUP, SESSIONS, Record
-from thesis.session import read_sessions
+from thesis.record import GROUP, Record
+from thesis.reproduce import provenance_here
 
 ABOUT = "about.json"
 _PACKAGES = ("torch", "numpy", "scipy", "mujoco", "dm_control", "pyarrow")
@@ -77,7 +78,7 @@ def _about(
             for group, count in record.groups().items()
         ],
         "here": {
-            **asdict(Provenance.here()),
+            **provenance_here(),
             "cores": available_cores(),
             "platform": platform.platform(),
             "python": platform.python_version(),

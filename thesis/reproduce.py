@@ -1,245 +1,119 @@
-"""`reproduce`: all runs of the protocol, whatever stops them in between."""
+"""The thesis' protocol as a plan of `offbeat.sweeps`."""
 
 from __future__ import annotations
 
-import json
-import os
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, cast
 
-from offbeat.data.store import save
-from offbeat.errors import InputError, one_of
-from offbeat.files import writable, write_json
-from offbeat.sweeps.engines import engine_named
-from thesis.execute import SCORES, Task
-from thesis.progress import Progress, duration
+from offbeat.config import ModelConfig, TrainConfig
+from offbeat.data.scaler import Scaler
+from offbeat.data.trajectory import Dataset
+from offbeat.metrics import row_0_constant
+from offbeat.models.model import Model
+from offbeat.sweeps import plan
+from offbeat.sweeps.provenance import provenance
+from offbeat.sweeps.running import SweepResult, run_plan
+from thesis.fingerprint import fingerprint
 from thesis.protocol import Protocol, Run, select
-from thesis.provenance import Provenance
-from thesis.record import Record, Row, group_of, group_text
-from thesis.session import Session, curve_of
-
-MIXED = ("refuse", "accept", "redo")
+from thesis.record import Record
 
 
 @dataclass(frozen=True)
-class Reproduction:
-    """What a call of `reproduce` left behind.
+class ThesisPlan(plan.Plan):
+    """The runs of a protocol.
 
     Attributes:
-        folder: holds `record.parquet`, `record.csv`, `curves.parquet`, `curves.csv`, `runs/`.
-        record: all runs that are finished, those of earlier calls too.
-        asked: runs that were asked for.
-        seconds: wall time of this call.
+        protocol: every number of it.
     """
 
-    folder: Path
-    record: Record
-    asked: tuple[Run, ...]
-    seconds: float
+    file: ClassVar[str] = "protocol.json"
+    noun: ClassVar[str] = "protocol"
+    record: ClassVar[type[Record]] = Record
 
-    @property
-    def missing(self) -> tuple[Run, ...]:
-        """Runs that were asked for and are not finished."""
-        return tuple(run for run in self.asked if run.run_id not in self.record.runs)
+    protocol: Protocol
 
-    def __str__(self) -> str:
-        done = len(self.asked) - len(self.missing)
-        spent = sum(row["seconds"] for row in self.record.runs.values())
-        text = (
-            f"{self.folder}: {done} of {len(self.asked)} runs are in the record, which took "
-            f"{duration(spent)} of processes in all; this call: {duration(self.seconds)}"
-        )
-        return text if not self.missing else f"{text}. The same command goes on"
+    def runs(self) -> tuple[plan.Run, ...]:
+        """Those of the protocol."""
+        return self.protocol.runs()
+
+    def settings(self) -> Mapping[str, Any]:
+        """Every number of the protocol."""
+        return asdict(self.protocol)
+
+    def simulate(self, *, progress: bool) -> Dataset:
+        """Hopper, as the protocol says."""
+        return self.protocol.simulate(progress=progress)
+
+    def parts(self, recorded: Dataset, run: plan.Run) -> plan.Parts:
+        """Of one fraction and repeat of an experiment."""
+        return self.protocol.cut(recorded, cast(Run, run))
+
+    def scaler(self, recorded: Dataset, train: Dataset) -> Scaler:
+        """Fitted on all trajectories, as the thesis does."""
+        return Scaler.fit(self.protocol.scaler, recorded)
+
+    def model_config(self, label: str) -> ModelConfig:
+        """As the protocol says."""
+        return self.protocol.model_config(label)
+
+    def train_config(self, run: plan.Run) -> TrainConfig:
+        """As the protocol says."""
+        return self.protocol.train_config(cast(Run, run))
+
+    def steps(self, run: plan.Run) -> int:
+        """Epochs times batches."""
+        return self.protocol.steps(cast(Run, run))
+
+    def draw(self, run: plan.Run) -> Hashable:
+        """The seed, and the fraction."""
+        return run.seed_draw, cast(Run, run).observed_fraction
+
+    def fingerprint(self, recorded: Dataset) -> str:
+        """That of version 0.1.0, by which the record names its data."""
+        return recorded.fingerprint(version=1)
+
+    def provenance(self) -> dict[str, str]:
+        """As the record names it."""
+        return provenance_here()
+
+    def columns(
+        self, run: plan.Run, model: Model, test: Dataset, recorded: Dataset
+    ) -> dict[str, Any]:
+        """The constant c of the masked first rows, their fraction, and the simulator."""
+        batch = model.batch(test)
+        masked = ~batch.mask[:, 0].any(dim=1)
+        return {
+            "row_0_constant": row_0_constant(batch),
+            "hidden_rows_0_share": float(masked.double().mean()),
+            "mujoco": str(recorded.meta.get("versions", {}).get("mujoco", "unknown")),
+        }
+
+
+def provenance_here() -> dict[str, str]:
+    """What makes runs in this process, as it stood when it was first asked."""
+    if not _HERE:
+        found = provenance(fingerprint())
+        _HERE.update({("kernel_body" if k == "scan_backend" else k): v for k, v in found.items()})
+    return dict(_HERE)
+
+
+_HERE: dict[str, str] = {}
 
 
 def reproduce(
-    protocol: Protocol,
-    out: str | Path,
-    *,
-    engine: str = "local",
-    only: str | None = None,
-    record: str | Path | None = None,
-    mixed: str = "refuse",
-    processes: int | None = None,
-    threads: int = 1,
-    budget_minutes: float | None = None,
-    engine_options: Mapping[str, Any] | None = None,
-    progress: bool = True,
-) -> Reproduction:
+    protocol: Protocol, out: str | Path, *, only: str | None = None, **options: Any
+) -> SweepResult:
     """Does the runs of a protocol that are not done yet, and keeps a record of them.
-
-    Killed at any moment, the same call goes on where it was and ends with the same numbers.
 
     Args:
         protocol: what to do.
         out: folder for data, runs and the record.
-        engine: `local`, `ray` or `slurm`; all give the same numbers. The workers of a cluster
-            must see `out` under the same path.
         only: a filter such as `experiment=1,model=ode_rnn`.
-        record: folder of another record, a committed one say; runs in it are not done again.
-        mixed: what to do where the record holds runs made by other code, on another processor,
-            with another scan backend, torch or data: `refuse` to go on, `accept` them as they are
-            marked, or `redo` them.
-        processes: runs at a time; by default what there is room for.
-        threads: of each run.
-        budget_minutes: stop after so long, in the middle of runs; they go on next time.
-        engine_options: of Ray or Slurm.
-        progress: show how far it is on standard error.
+        **options: of `offbeat.sweeps.running.run_plan`.
 
     Raises:
-        InputError: an argument is wrong, `out` belongs to another protocol or is in use, or runs
-            would be mixed.
-        DivergenceError: a training left the finite numbers; all other runs were done.
-        OffbeatError: a run failed otherwise, or lost its process three times.
+        InputError, DivergenceError, OffbeatError: as `run_plan`.
     """
-    started = time.monotonic()
-    one_of("value of mixed", mixed, MIXED)
-    if budget_minutes is not None and not budget_minutes >= 0:
-        raise InputError(f"budget_minutes must be at least 0, got {budget_minutes}")
-    out = writable(out, folder=True)
-    asked = select(protocol.runs(), only)
-    out.mkdir(parents=True, exist_ok=True)
-    with _alone(out):
-        _same_protocol(out, protocol)
-        recorded, fingerprint = _data(out, protocol, progress)
-        tasks = {
-            run.run_id: Task(
-                run, protocol, recorded, fingerprint, out / "runs" / run.run_id, threads
-            )
-            for run in protocol.runs()
-        }
-        here = group_of({**asdict(Provenance.here()), "data": fingerprint[:12]})
-        shown = Progress(out / "status.json", show=progress)
-        kept = _known(out, record, tasks)
-        kept = _unmixed(kept, mixed, tasks, here, shown)
-        kept.in_order(tasks).write(out)
-        waiting = [tasks[run.run_id] for run in asked if run.run_id not in kept.runs]
-        if waiting and budget_minutes != 0:
-            runner = engine_named(
-                engine,
-                processes=processes,
-                threads=threads,
-                options=engine_options,
-                folder=out / engine,
-            )
-            shown.say(f"{len(asked) - len(waiting)}/{len(asked)} runs done; {runner.description}")
-            deadline = None if budget_minutes is None else started + 60 * budget_minutes
-            session = Session(out, runner, shown, kept, tuple(tasks), here)
-            kept = session.run(waiting, asked=asked, deadline=deadline)
-    return Reproduction(out, kept, asked, time.monotonic() - started)
-
-
-# --- the folder -----------------------------------------------------------------------------------
-
-
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """Holds the folder for this process."""
-    with (out / ".lock").open("w") as file:
-        if os.name == "posix":
-            import fcntl
-
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise InputError(
-                    f"another process works in {out} (see {out / 'status.json'}); let it end, or "
-                    "give another folder"
-                ) from None
-        yield
-
-
-def _same_protocol(out: Path, protocol: Protocol) -> None:
-    """Writes the protocol down, or compares it with what the folder was begun with."""
-    path, now = out / "protocol.json", json.loads(json.dumps(asdict(protocol)))
-    try:
-        then = dict(json.loads(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        write_json(path, now)
-        return
-    except (ValueError, TypeError):
-        then = {}
-    changed = [f"{k} ({then.get(k)!r} then, {v!r} now)" for k, v in now.items() if then.get(k) != v]
-    if changed:
-        raise InputError(
-            f"{out} holds another protocol: {', '.join(changed)}; give the same, or another folder"
-        )
-
-
-def _data(out: Path, protocol: Protocol, progress: bool) -> tuple[Path, str]:
-    """The recorded trajectories, simulated once, and the fingerprint of their content."""
-    path, facts = out / "data" / "recorded.parquet", out / "data" / "recorded.json"
-    if path.is_file():
-        try:
-            return path, str(json.loads(facts.read_text(encoding="utf-8"))["fingerprint"])
-        except (OSError, ValueError, KeyError, TypeError):
-            path.unlink()  # begun and not finished
-    recorded = protocol.simulate(progress=progress)
-    fingerprint = recorded.fingerprint()
-    facts.unlink(missing_ok=True)
-    save(recorded, path)
-    write_json(facts, {"fingerprint": fingerprint, **recorded.meta})
-    return path, fingerprint
-
-
-def _known(out: Path, record: str | Path | None, tasks: Mapping[str, Task]) -> Record:
-    """All that is done: the folder's record, finished runs that it lacks, and the other record."""
-    kept = Record.read(out)
-    for name, task in tasks.items():
-        row = None if name in kept.runs else task.result()
-        if row is not None:
-            kept = kept.with_run(row, curve_of(task))
-    if record is not None:
-        other = Record.read(record)
-        if not other.runs:
-            raise InputError(f"{record} holds no record; give the folder of record.parquet")
-        kept = kept.merged(other)
-    for name, row in kept.runs.items():
-        _check_row(name, row, tasks)
-    return kept
-
-
-def _check_row(name: str, row: Row, tasks: Mapping[str, Task]) -> None:
-    """A row must be of a run of this protocol: tiny ones have the same names."""
-    if name not in tasks:
-        raise InputError(f"the record holds {name!r}, which is not a run of this protocol")
-    run, protocol = tasks[name].run, tasks[name].protocol
-    expected = {**asdict(run), "run_id": name, "steps": protocol.steps(run)}
-    wrong = [f"{k} {row[k]!r}, expected {v!r}" for k, v in expected.items() if row[k] != v]
-    if wrong:
-        raise InputError(
-            f"the record holds {name!r} of another protocol ({'; '.join(wrong)}); give a record of "
-            "this one"
-        )
-
-
-def _unmixed(
-    kept: Record, mixed: str, tasks: Mapping[str, Task], here: tuple[str, ...], shown: Progress
-) -> Record:
-    """Looks at who made what; says so aloud where it was not made as it would be made here."""
-    others = {group: count for group, count in kept.groups().items() if group != here}
-    if not others:
-        return kept
-    lines = [
-        f"{count} run{'s' * (count > 1)} with {group_text(group, here)}"
-        for group, count in others.items()
-    ]
-    made = f"{'; '.join(lines)} (here: {group_text(here)})"
-    if mixed == "refuse":
-        raise InputError(
-            f"the record holds runs that were made otherwise than they would be here: {made}; give "
-            "mixed=accept to keep them, marked as they are, mixed=redo to do them again, or "
-            "another folder"
-        )
-    gone = [name for name, row in kept.runs.items() if group_of(row) in others]
-    if mixed == "accept":
-        shown.say(f"warning: the record is mixed, {made}; its columns mark them")
-        return kept
-    shown.say(f"warning: these are done again: {made}")
-    for name in gone:
-        (tasks[name].folder / SCORES).unlink(missing_ok=True)
-    return kept.without(gone)
+    return run_plan(ThesisPlan(protocol), out, asked=select(protocol.runs(), only), **options)

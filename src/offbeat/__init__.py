@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from offbeat.models.zoo import THESIS_MODELS, make_model, thesis_config, train_config
     from offbeat.stream.options import StreamOptions
     from offbeat.stream.stream import Stream
+    from offbeat.sweeps.running import SweepResult
+    from offbeat.sweeps.sweep import sweep
     from offbeat.training import FitResult, fit
 
 __version__ = "0.2.0.dev0"
@@ -56,6 +58,7 @@ _HOMES = {
     "Scores": "metrics",
     "Stream": "stream.stream",
     "StreamOptions": "stream.options",
+    "SweepResult": "sweeps.running",
     "THESIS_MODELS": "models.zoo",
     "Trajectory": "data.trajectory",
     "TwoSided": "answers.two_sided",
@@ -87,12 +90,14 @@ _HOMES = {
     "simulate": "data.simulate",
     "split": "data.splits",
     "split_in_time": "data.splits",
+    "sweep": "sweeps.sweep",
     "thesis_config": "models.zoo",
     "train_config": "models.zoo",
     "windows": "data.windows",
 }
 
 __all__ = [
+    "THESIS_MODELS",
     "Batch",
     "Comparison",
     "Dataset",
@@ -112,7 +117,7 @@ __all__ = [
     "SplitConfig",
     "Stream",
     "StreamOptions",
-    "THESIS_MODELS",
+    "SweepResult",
     "TrainConfig",
     "Trajectory",
     "TwoSided",
@@ -144,6 +149,7 @@ __all__ = [
     "simulate",
     "split",
     "split_in_time",
+    "sweep",
     "thesis_config",
     "train_config",
     "windows",

@@ -9,8 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from offbeat.sweeps.engines.base import Ending, Engine, attempt
-from thesis.execute import Task
+from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 from thesis.protocol import Protocol
 from thesis.record import Record
 
@@ -42,18 +41,18 @@ class InThisProcess(Engine):
     def __init__(self, capacity: int = 1) -> None:
         self.capacity, self.description = capacity, "this process"
         self.given: list[str] = []
-        self._tasks: list[Task] = []
+        self._jobs: list[Job] = []
 
-    def submit(self, task: Task) -> None:
-        self.given.append(task.run.run_id)
-        self._tasks.append(task)
+    def submit(self, job: Job) -> None:
+        self.given.append(job.name)
+        self._jobs.append(job)
 
     def wait(self, seconds: float) -> list[Ending]:
-        task = self._tasks.pop(0)
-        return [Ending(task, attempt(task))]
+        job = self._jobs.pop(0)
+        return [Ending(job, attempt(job))]
 
     def stop(self) -> None:
-        self._tasks.clear()
+        self._jobs.clear()
 
 
 def numbers(record: Record) -> dict[str, Any]:

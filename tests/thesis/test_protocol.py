@@ -153,7 +153,7 @@ def test_a_protocol_survives_json():
     [
         ({"epochs_of_repeats": (50,)}, "one number for each of the 4"),
         ({"observed_fractions": (0.9, 0.901, 0.5, 0.3)}, "differ by a percent"),
-        ({"observed_fractions": (0.9, 0.7, 0.5, 0.0)}, "shares above 0"),
+        ({"observed_fractions": (0.9, 0.7, 0.5, 0.0)}, "above 0 and at most 1"),
         ({"repeats": 0}, "repeats must be from 1"),
         ({"epochs_of_curves": 0}, "at least 1"),
     ],

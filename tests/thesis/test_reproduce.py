@@ -22,17 +22,16 @@ from experiment_helpers import (
 
 import offbeat as ob
 from offbeat import kernels
-from thesis import execute as execution
-from thesis import reproduce as command
-from thesis import session
+from offbeat.sweeps import running as command
+from offbeat.sweeps import session
+from offbeat.sweeps import task as execution
+from offbeat.sweeps.progress import seconds_left
 from thesis.__main__ import main
-from thesis.execute import execute
 from thesis.fingerprint import fingerprint
-from thesis.progress import seconds_left
 from thesis.protocol import Protocol, select
 from thesis.publish import publish
 from thesis.record import CURVE_COLUMNS, RUN_COLUMNS, SCORINGS, Record
-from thesis.reproduce import reproduce
+from thesis.reproduce import ThesisPlan, reproduce
 
 
 @pytest.fixture
@@ -491,7 +490,7 @@ def check_nothing_lost_and_nothing_twice(out, process, expected):
     assert process.returncode == 0, said
     record = Record.read(out)
     assert numbers(record) == numbers(expected)
-    finished = [line for line in said.splitlines() if "published RMSE" in line]
+    finished = [line for line in said.splitlines() if "test RMSE" in line]
     assert len(finished) == len(expected.runs), said
     (session,) = json.loads((out / "sessions.json").read_text(encoding="utf-8"))
     assert sorted(session["runs"]) == sorted(expected.runs)
@@ -547,10 +546,12 @@ def test_a_finished_run_is_left_alone(done, tmp_path):
     run = SMALL.runs()[0]
     facts = json.loads((out / "data" / "recorded.json").read_text(encoding="utf-8"))
     recorded = out / "data" / "recorded.parquet"
-    task = execution.Task(run, SMALL, recorded, facts["fingerprint"], out / "runs" / run.run_id)
+    task = execution.Task(
+        run, ThesisPlan(SMALL), recorded, facts["fingerprint"], out / "runs" / run.run_id
+    )
     before = (task.folder / "scores.json").stat().st_mtime_ns
-    execute(task)
+    task.perform()
     assert (task.folder / "scores.json").stat().st_mtime_ns == before
     strange = replace(task, fingerprint="0" * 64, folder=tmp_path / "other")
     with pytest.raises(ob.FileFormatError, match="does not hold the trajectories"):
-        execute(strange)
+        strange.perform()

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from offbeat.errors import OffbeatError
+from offbeat.sweeps.record import SESSIONS
 from thesis.protocol import Protocol
-from thesis.record import SESSIONS
 from thesis.report import thesis_numbers as thesis
 from thesis.report.records import PROVENANCE, Record
 from thesis.report.tables import label, percent

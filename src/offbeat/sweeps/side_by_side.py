@@ -1,21 +1,14 @@
-"""Training runs side by side: each in a process of its own, with one thread."""
+"""Models of one data set trained side by side: each in a process of its own, with one thread."""
 
 from __future__ import annotations
 
 import csv
-import multiprocessing
-import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import connection
 from pathlib import Path
-from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from offbeat.config import TrainConfig
@@ -24,6 +17,8 @@ from offbeat.data.store import load
 from offbeat.errors import OffbeatError
 from offbeat.models.zoo import make_model
 from offbeat.run import EpochRecord
+from offbeat.sweeps.engines import base
+from offbeat.sweeps.engines.local import LocalEngine
 from offbeat.training import fit
 
 
@@ -47,7 +42,7 @@ class Job:
     validation: Path
     folder: Path
 
-    def run(self, *, progress: bool) -> None:
+    def perform(self, *, progress: bool = False) -> None:
         """Trains, or goes on training; the same in any process."""
         train, validation = load(self.train), load(self.validation)
         model = make_model(self.name, train, scaler=self.scaler, seed=self.training.seed)
@@ -86,10 +81,10 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
         for job in jobs:
             if progress:
                 print(f"training {job.name}", file=sys.stderr)
-            job.run(progress=progress)
+            job.perform(progress=progress)
         return
-    waiting, running = list(jobs), dict[Any, tuple[Job, Any, Any]]()
-    context = multiprocessing.get_context("spawn")  # a fork after torch has computed can hang
+    waiting, running = list(jobs), list[str]()
+    engine = LocalEngine(workers, 1)
     total = sum(job.training.epochs for job in jobs)
     with tqdm(
         total=total, desc="training", unit="epoch", disable=None if progress else True
@@ -97,68 +92,32 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
         try:
             while waiting or running:
                 while waiting and len(running) < workers:
-                    job = waiting.pop(0)
-                    receiver, sender = context.Pipe(duplex=False)
-                    process = context.Process(target=_run_apart, args=(job, sender), daemon=True)
-                    process.start()
-                    sender.close()
-                    running[process.sentinel] = (job, process, receiver)
-                for sentinel in connection.wait(list(running), timeout=0.5):
-                    _collect(*running.pop(sentinel))
+                    running.append(waiting[0].name)
+                    engine.submit(waiting.pop(0))
+                for ending in engine.wait(0.5):
+                    running.remove(ending.job.name)
+                    raise_failure(ending)
                 new = sum(len(job.history()) for job in jobs) - bar.n
                 if new:
-                    names = ", ".join(job.name for job, _, _ in running.values())
-                    bar.set_postfix_str(names, refresh=False)
+                    bar.set_postfix_str(", ".join(running), refresh=False)
                     bar.update(new)
         finally:
-            for _, process, _ in running.values():
-                process.terminate()
-                process.join()
+            engine.stop()
 
 
-def _run_apart(job: Job, sender: Any) -> None:
-    """A process that trains one model; it ends with the process that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    try:
-        job.run(progress=False)
-    except OffbeatError as error:
-        sender.send(error)
-
-
-def end_with_parent() -> None:
-    """Ends this process when the one that started it ends; for a thread of its own."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _collect(job: Job, process: Any, receiver: Any) -> None:
-    process.join()
-    if receiver.poll():
-        with suppress(EOFError):  # it ended without a word
-            raise receiver.recv()
-    if process.exitcode:
+def raise_failure(ending: base.Ending) -> None:
+    """Raises what a job ended with, if it did not succeed."""
+    if ending.failure is not None:
+        raise ending.failure.error(ending.failure.message)
+    if ending.lost:
         raise OffbeatError(
-            f"the process that trained {job.name!r} ended with exit code {process.exitcode}; run "
-            "the same again, it goes on where it was (with workers=1 it needs less memory)"
+            f"the process that trained {ending.job.name!r} was ended; run the same again, it goes "
+            "on where it was (with workers=1 it needs less memory)"
         )
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Sums in one order, on any machine; and small steps are faster so."""
-    with threads_of_torch(1):
+    with base.threads_of_torch(1):
         yield
-
-
-@contextmanager
-def threads_of_torch(threads: int) -> Iterator[None]:
-    """So many threads for torch, inside the block."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

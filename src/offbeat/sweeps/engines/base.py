@@ -1,48 +1,66 @@
-"""What an engine is: it takes tasks, and says how each of them ended."""
+"""What an engine is: it takes jobs, and says how each of them ended."""
 
 from __future__ import annotations
 
 import traceback
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Protocol
 
 from offbeat.errors import DivergenceError, OffbeatError
-from thesis.execute import Task, execute
+
+
+class Job(Protocol):
+    """Something to do in any process: small, can be pickled, done once however often it runs."""
+
+    @property
+    def name(self) -> str:
+        """Of the job, unique within an engine."""
+
+    def perform(self) -> None:
+        """Does it, or goes on where a process that was killed left off."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a task did not succeed, in words that pass between processes.
+    """Why a job did not succeed, in words that pass between processes.
 
     Attributes:
         message: one line.
-        diverged: True if the training left the finite numbers: other runs go on.
+        error: class of the error.
     """
 
     message: str
-    diverged: bool = False
+    error: type[OffbeatError] = OffbeatError
+
+    @property
+    def diverged(self) -> bool:
+        """The training left the finite numbers: other runs go on."""
+        return issubclass(self.error, DivergenceError)
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a task ended.
+    """How a job ended.
 
     Attributes:
-        task: the task.
-        failure: None if the run is finished.
-        lost: the process or machine that ran it is gone; the task can be given again.
+        job: the job.
+        failure: None if it is done.
+        lost: the process or machine that ran it is gone; the job can be given again.
     """
 
-    task: Task
+    job: Job
     failure: Failure | None = None
     lost: bool = False
 
 
 class Engine(ABC):
-    """Runs tasks somewhere, some at a time.
+    """Runs jobs somewhere, some at a time.
 
     Attributes:
-        capacity: tasks at a time.
+        capacity: jobs at a time.
         description: one line for the user.
     """
 
@@ -50,26 +68,39 @@ class Engine(ABC):
     description: str
 
     @abstractmethod
-    def submit(self, task: Task) -> None:
-        """Starts a task; not called with more than `capacity` of them under way."""
+    def submit(self, job: Job) -> None:
+        """Starts a job; not called with more than `capacity` of them under way."""
 
     @abstractmethod
     def wait(self, seconds: float) -> list[Ending]:
-        """Waits until a task has ended, or for so long; returns those that have."""
+        """Waits until a job has ended, or for so long; returns those that have."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Ends everything that is under way; a run goes on from its last checkpoint later."""
+        """Ends everything that is under way."""
 
 
-def attempt(task: Task) -> Failure | None:
-    """Does a task and says how it went; what engines run in their processes."""
+def attempt(job: Job) -> Failure | None:
+    """Does a job and says how it went; what engines run in their processes."""
     try:
-        execute(task)
-    except DivergenceError as error:
-        return Failure(f"{task.run.run_id}: {error}", diverged=True)
-    except (OffbeatError, OSError) as error:
-        return Failure(f"{task.run.run_id}: {error}")
+        job.perform()
+    except OffbeatError as error:
+        return Failure(f"{job.name}: {error}", type(error))
+    except OSError as error:
+        return Failure(f"{job.name}: {error}")
     except Exception:
-        return Failure(f"{task.run.run_id}: {traceback.format_exc()}")
+        return Failure(f"{job.name}: {traceback.format_exc()}")
     return None
+
+
+@contextmanager
+def threads_of_torch(threads: int) -> Iterator[None]:
+    """So many threads for torch, inside the block."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

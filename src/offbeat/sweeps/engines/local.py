@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from offbeat.data.memory import available_memory
 from offbeat.data.simulate import available_cores
-from offbeat.sweeps.engines.base import Ending, Engine, attempt
-from offbeat.sweeps.side_by_side import end_with_parent
-from thesis.execute import Task
+from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 
 _GIB_PER_PROCESS = 2.0  # data of the full protocol, its parts, torch: 1.7 at the peak
 
@@ -39,10 +38,10 @@ class LocalEngine(Engine):
         self._context = multiprocessing.get_context("spawn")
         self._workers: list[_Worker] = []
 
-    def submit(self, task: Task) -> None:
-        """Gives the task to an idle process; starts one if there is none."""
+    def submit(self, job: Job) -> None:
+        """Gives the job to an idle process; starts one if there is none."""
         for worker in self._workers:
-            if worker.task is None:
+            if worker.job is None:
                 break
         else:
             ours, theirs = self._context.Pipe()
@@ -51,28 +50,28 @@ class LocalEngine(Engine):
             theirs.close()
             worker = _Worker(process, ours)
             self._workers.append(worker)
-        worker.task = task
-        with suppress(OSError):  # it has died while idle; `wait` finds the task lost
-            worker.pipe.send(task)
+        worker.job = job
+        with suppress(OSError):  # it has died while idle; `wait` finds the job lost
+            worker.pipe.send(job)
 
     def wait(self, seconds: float) -> list[Ending]:
-        """Waits until a process is done with its task or has died."""
-        busy = [(worker, worker.task) for worker in self._workers if worker.task is not None]
+        """Waits until a process is done with its job or has died."""
+        busy = [(worker, worker.job) for worker in self._workers if worker.job is not None]
         if not busy:
             return []
         signs = [sign for worker, _ in busy for sign in (worker.pipe, worker.process.sentinel)]
         connection.wait(signs, timeout=seconds)
         endings = []
-        for worker, task in busy:
+        for worker, job in busy:
             try:
                 if worker.pipe.poll():
-                    endings.append(Ending(task, worker.pipe.recv()))
-                    worker.task = None
+                    endings.append(Ending(job, worker.pipe.recv()))
+                    worker.job = None
                     continue
             except (EOFError, OSError):
                 worker.process.join()
             if worker.process.exitcode is not None:
-                endings.append(Ending(task, lost=True))
+                endings.append(Ending(job, lost=True))
                 self._workers.remove(worker)
                 worker.pipe.close()
         return endings
@@ -81,7 +80,7 @@ class LocalEngine(Engine):
         """Ends all processes: idle ones by closing their pipe, others by force."""
         for worker in self._workers:
             worker.pipe.close()
-            if worker.task is not None:
+            if worker.job is not None:
                 worker.process.kill()
         for worker in self._workers:
             worker.process.join()
@@ -92,27 +91,31 @@ class LocalEngine(Engine):
 class _Worker:
     process: Any
     pipe: Any
-    task: Task | None = None
+    job: Job | None = None
 
 
 def _serve(pipe: Any) -> None:
-    """A process that does one task after another, and ends with the process that started it."""
+    """A process that does one job after another, and ends with the process that started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
     tqdm.set_lock(threading.RLock())  # by default a semaphore, which a killed process leaves behind
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:
-            task = pipe.recv()
+            job = pipe.recv()
         except EOFError:
             return
-        pipe.send(attempt(task))
+        pipe.send(attempt(job))
+
+
+def _end_with_parent() -> None:
+    """Ends this process when the one that started it ends; for a thread of its own."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _room() -> int:
-    """Processes that memory has room for."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        kib = next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration, ValueError):
-        return available_cores()
-    return max(1, int(kib / 2**20 / _GIB_PER_PROCESS))
+    """Processes that memory has room for, within the limits of the container."""
+    free = available_memory()
+    return available_cores() if free is None else max(1, int(free / 2**30 / _GIB_PER_PROCESS))

@@ -7,12 +7,11 @@ from typing import Any
 
 from offbeat.data.simulate import available_cores
 from offbeat.errors import InputError, require
-from offbeat.sweeps.engines.base import Ending, Engine, attempt
-from thesis.execute import Task
+from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 
 
 class RayEngine(Engine):
-    """Tasks of Ray, whose workers keep the data in memory from one task to the next.
+    """Jobs of Ray, whose workers keep the data in memory from one job to the next.
 
     Connects to the cluster that the environment names (`RAY_ADDRESS`) or that runs on this machine;
     where there is none, it starts one here and ends it with the experiment.
@@ -45,32 +44,32 @@ class RayEngine(Engine):
         self.description = f"Ray on {where}, {self.capacity} at a time, {cores} cores"
         # A lost worker's run is given again by the session, which counts how often.
         self._attempt = self._ray.remote(num_cpus=threads, max_retries=0)(attempt)
-        self._tasks: dict[Any, Task] = {}
+        self._jobs: dict[Any, Job] = {}
 
-    def submit(self, task: Task) -> None:
-        """Gives the task to the cluster."""
-        self._tasks[self._attempt.remote(task)] = task
+    def submit(self, job: Job) -> None:
+        """Gives the job to the cluster."""
+        self._jobs[self._attempt.remote(job)] = job
 
     def wait(self, seconds: float) -> list[Ending]:
-        """Waits until a task has ended or its worker is gone."""
+        """Waits until a job has ended or its worker is gone."""
         ended, _ = self._ray.wait(
-            list(self._tasks), num_returns=1, timeout=seconds, fetch_local=True
+            list(self._jobs), num_returns=1, timeout=seconds, fetch_local=True
         )
         endings = []
         for reference in ended:
-            task = self._tasks.pop(reference)
+            job = self._jobs.pop(reference)
             try:
-                endings.append(Ending(task, self._ray.get(reference)))
+                endings.append(Ending(job, self._ray.get(reference)))
             except self._ray.exceptions.RayTaskError:
                 raise  # `attempt` lets nothing through: the worker can't run Offbeat
             except self._ray.exceptions.RayError:
-                endings.append(Ending(task, lost=True))
+                endings.append(Ending(job, lost=True))
         return endings
 
     def stop(self) -> None:
         """Ends everything that is under way, and the cluster if it was started here."""
-        for reference in self._tasks:
+        for reference in self._jobs:
             self._ray.cancel(reference, force=True)
-        self._tasks.clear()
+        self._jobs.clear()
         if self._started:
             self._ray.shutdown()

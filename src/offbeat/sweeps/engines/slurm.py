@@ -10,8 +10,7 @@ from typing import Any
 
 from offbeat.data.simulate import available_cores
 from offbeat.errors import InputError, require
-from offbeat.sweeps.engines.base import Ending, Engine, attempt
-from thesis.execute import Task
+from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 
 _AT_A_TIME = 100  # below the number of jobs that clusters allow one user
 
@@ -41,50 +40,50 @@ class SlurmEngine(Engine):
         self.capacity = processes or (max(1, available_cores() // threads) if here else _AT_A_TIME)
         what = "submitit on this machine (no Slurm found)" if here else "Slurm through submitit"
         self.description = f"{what}, {self.capacity} jobs at a time"
-        self._jobs: list[tuple[Any, Task]] = []
+        self._given: list[tuple[Any, Job]] = []
 
-    def submit(self, task: Task) -> None:
+    def submit(self, job: Job) -> None:
         """Queues a job."""
-        self._jobs.append((self._executor.submit(_Job(), task), task))
+        self._given.append((self._executor.submit(_Submitted(), job), job))
 
     def wait(self, seconds: float) -> list[Ending]:
         """Asks after the jobs until one has ended."""
         end = time.monotonic() + seconds
         while True:
-            ended = [(job, task) for job, task in self._jobs if job.done()]
+            ended = [pair for pair in self._given if pair[0].done()]
             if ended or time.monotonic() >= end:
                 break
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
-        self._jobs = [pair for pair in self._jobs if pair not in ended]
-        return [_ending(job, task) for job, task in ended]
+        self._given = [pair for pair in self._given if pair not in ended]
+        return [_ending(*pair) for pair in ended]
 
     def stop(self) -> None:
         """Cancels all jobs."""
-        for job, _ in self._jobs:
+        for submitted, _ in self._given:
             with suppress(Exception):  # it may have ended in between
-                job.cancel()
-        self._jobs.clear()
+                submitted.cancel()
+        self._given.clear()
 
 
-class _Job:
+class _Submitted:
     """What a job runs. submitit asks `checkpoint` before a job is taken away."""
 
-    def __call__(self, task: Task) -> Any:
-        return attempt(task)
+    def __call__(self, job: Job) -> Any:
+        return attempt(job)
 
-    def checkpoint(self, task: Task) -> Any:
+    def checkpoint(self, job: Job) -> Any:
         """The same again: the run's own checkpoints hold how far it has come."""
         from submitit.helpers import DelayedSubmission
 
-        return DelayedSubmission(self, task)
+        return DelayedSubmission(self, job)
 
 
-def _ending(job: Any, task: Task) -> Ending:
+def _ending(submitted: Any, job: Job) -> Ending:
     from submitit.core.utils import FailedJobError, UncompletedJobError
 
     try:
-        return Ending(task, job.result())
+        return Ending(job, submitted.result())
     except FailedJobError:
         raise  # `attempt` lets nothing through: the node can't run Offbeat
     except UncompletedJobError:
-        return Ending(task, lost=True)
+        return Ending(job, lost=True)

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import platform
 import subprocess
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import offbeat
@@ -17,45 +15,27 @@ import offbeat
 PACKAGE = Path(offbeat.__file__).parent
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """What made a run.
+def provenance(bits: str) -> dict[str, str]:
+    """What makes runs in this process, as columns of a record.
 
-    Attributes:
-        commit: `git describe` of the checkout, `-dirty` with changes outside `results/`; else the
-            package's version.
+    Args:
         bits: fingerprint of small trainings; equal where the code ends in the same numbers.
-        cpu: name of the processor.
-        kernel_body: which body of the scan ran.
-        torch: version.
+
+    Returns:
+        `commit` (`git describe` of the checkout, `-dirty` with changes outside `results/`; else the
+        package's version), `bits`, `cpu`, `scan_backend` and the version of `torch`.
     """
-
-    commit: str
-    bits: str
-    cpu: str
-    kernel_body: str
-    torch: str
-
-    @classmethod
-    def here(cls) -> Provenance:
-        """Of this process, as it stood when it was first asked."""
-        return _here()
-
-
-@cache
-def _here() -> Provenance:
     import torch
 
-    from thesis.fingerprint import fingerprint
-
-    return Provenance(commit(), fingerprint(), cpu(), kernel_body(), torch.__version__)
-
-
-def kernel_body() -> str:
-    """Which body of `kernels.scan` runs here."""
     from offbeat.kernels import backend
 
-    return backend()[0]
+    return {
+        "commit": commit(),
+        "bits": bits,
+        "cpu": cpu(),
+        "scan_backend": backend()[0],
+        "torch": torch.__version__,
+    }
 
 
 def commit() -> str:

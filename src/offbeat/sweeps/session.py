@@ -1,4 +1,4 @@
-"""A session of an experiment: tasks go to an engine, finished runs into the record."""
+"""A session of a sweep: tasks go to an engine, finished runs into the record."""
 
 from __future__ import annotations
 
@@ -13,18 +13,13 @@ from typing import Any
 from offbeat.errors import DivergenceError, OffbeatError
 from offbeat.files import write_json
 from offbeat.sweeps.engines.base import Engine
-from thesis.execute import Task
-from thesis.progress import Progress, duration, seconds_left
-from thesis.protocol import Run
-from thesis.provenance import cpu
-from thesis.record import SESSIONS, Record, Row, group_of, group_text
+from offbeat.sweeps.plan import Run
+from offbeat.sweeps.progress import Progress, duration, seconds_left
+from offbeat.sweeps.provenance import cpu
+from offbeat.sweeps.record import SESSIONS, Group, Record
+from offbeat.sweeps.task import Task
 
 _ATTEMPTS = 3
-
-
-def curve_of(task: Task) -> tuple[Row, ...]:
-    """The lines of the table of curves that a run adds."""
-    return tuple({"run_id": task.run.run_id, **row} for row in task.log())
 
 
 class Session:
@@ -46,7 +41,7 @@ class Session:
         shown: Progress,
         record: Record,
         order: tuple[str, ...],
-        here: tuple[str, ...],
+        here: Group,
     ) -> None:
         self.out, self.engine, self.shown, self.record = out, engine, shown, record
         self.order, self.here = order, here
@@ -79,14 +74,14 @@ class Session:
             while (self.waiting or self.running) and not self._over():
                 while self.waiting and len(self.running) < self.engine.capacity:
                     task = self.waiting.popleft()
-                    self.running[task.run.run_id] = task
+                    self.running[task.name] = task
                     self.engine.submit(task)
                 for ending in self.engine.wait(self._patience()):
-                    del self.running[ending.task.run.run_id]
+                    task = self.running.pop(ending.job.name)
                     if ending.lost:
-                        self._again(ending.task)
+                        self._again(task)
                     elif ending.failure is None:
-                        self._finished(ending.task)
+                        self._finished(task)
                     elif ending.failure.diverged:
                         self.diverged.append(ending.failure.message)
                         self.shown.say(ending.failure.message)
@@ -119,7 +114,7 @@ class Session:
         return min(1.0, max(0.0, left))
 
     def _again(self, task: Task) -> None:
-        name = task.run.run_id
+        name = task.name
         self.attempts[name] = self.attempts.get(name, 0) + 1
         if self.attempts[name] >= _ATTEMPTS:
             raise OffbeatError(
@@ -136,33 +131,33 @@ class Session:
                 f"{task.folder} has no result although the run has ended; the workers must see "
                 "the same folder as this process"
             )
-        self.record = self.record.with_run(row, curve_of(task)).in_order(self.order)
+        self.record = self.record.with_run(row, task.curve()).in_order(self.order)
         self.record.write(self.out)
         self.session.update(row["run_id"])
-        group = group_of(row)
+        group = self.record.group_of(row)
         if group not in self.groups:
             self.groups.add(group)
             self.shown.say(
-                f"warning: {task.run.run_id} was made differently from this process: "
-                f"{group_text(group, self.here)}; the record marks it"
+                f"warning: {task.name} was made differently from this process: "
+                f"{self.record.group_text(group, self.here)}; the record marks it"
             )
-        rmse = {name: row[f"{name}_mse"] ** 0.5 for name in ("published", "honest")}
+        scoring = next(iter(self.record.SCORINGS))
+        rmse, trivial = (row[f"{which}{scoring}_mse"] ** 0.5 for which in ("", "last_value_"))
         self.shown.say(
-            f"[{self._done()}/{len(self.asked)}] {task.run.run_id}: published RMSE "
-            f"{rmse['published']:.4f}, honest {rmse['honest']:.4f}, "
-            f"{duration(row['seconds'])}; left: {duration(self._left())}"
+            f"[{self._done()}/{len(self.asked)}] {task.name}: test RMSE {rmse:.4f}, last value "
+            f"{trivial:.4f}, {duration(row['seconds'])}; left: {duration(self._left())}"
         )
 
     def _done(self) -> int:
         return sum(run.run_id in self.record.runs for run in self.asked)
 
     def _left(self) -> float | None:
-        mine = [row for row in self.record.runs.values() if group_of(row) == self.here]
+        mine = [row for row in self.record.runs.values() if self.record.group_of(row) == self.here]
         waiting = [task.run for task in self.waiting]
         return seconds_left(waiting, self._epochs(), mine, capacity=self.engine.capacity)
 
     def _epochs(self) -> dict[Run, int]:
-        return {task.run: len(task.log()) for task in self.running.values()}
+        return {task.run: len(task.curve()) for task in self.running.values()}
 
     def _show(self, *, now: bool = False) -> None:
         if not (now or self.shown.due()):
@@ -173,7 +168,7 @@ class Session:
             total=len(self.asked),
             left=self._left(),
             running=self._epochs(),
-            facts={"engine": self.engine.description, "diverged": self.diverged},
+            more={"engine": self.engine.description, "diverged": self.diverged},
         )
 
 

@@ -1,4 +1,4 @@
-"""How far an experiment has come: a line for a person, a file for everything else."""
+"""How far a sweep has come: a line for a person, a file for everything else."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.files import write_json
-from thesis.protocol import Run
-from thesis.record import Row
+from offbeat.sweeps.plan import Run
+from offbeat.sweeps.record import Row
 
 _EVERY_S = 5.0
 
@@ -96,7 +96,7 @@ class Progress:
         total: int,
         left: float | None,
         running: Mapping[Run, int],
-        facts: Mapping[str, Any],
+        more: Mapping[str, Any],
     ) -> None:
         """Shows the state of things, and writes it down.
 
@@ -105,7 +105,7 @@ class Progress:
             total: runs in all.
             left: s, or None where it is not known yet.
             running: runs under way with their finished epochs.
-            facts: more for the status file.
+            more: more for the status file.
         """
         self._last = time.monotonic()
         write_json(
@@ -120,7 +120,7 @@ class Progress:
                 ],
                 "updated_at": datetime.now(UTC).isoformat(timespec="seconds"),
                 "pid": os.getpid(),
-                **facts,
+                **more,
             },
         )
         if self._line:

@@ -5,7 +5,7 @@ import subprocess
 import pytest
 
 from offbeat import __version__
-from thesis import provenance
+from offbeat.sweeps import provenance
 
 
 @pytest.fixture

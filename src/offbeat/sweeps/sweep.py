@@ -1,0 +1,236 @@
+"""`sweep`: any models, trained and scored over repeats that share windows, masks and splits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from offbeat.config import ModelConfig, SplitConfig, TrainConfig, check_seed
+from offbeat.data.scaler import SCALERS, Scaler
+from offbeat.data.splits import apply_split
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import InputError, one_of
+from offbeat.models.zoo import train_config
+from offbeat.sweeps.fingerprint import fingerprint
+from offbeat.sweeps.plan import Parts, Plan, Run
+from offbeat.sweeps.provenance import provenance
+from offbeat.sweeps.running import SweepResult, run_plan
+
+if TYPE_CHECKING:
+    from offbeat.models.model import Model
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One training and its scores.
+
+    Attributes:
+        model: label of the model.
+        repeat: counted from 0.
+        epochs: passes over the training part.
+        seed_draw: of windows, masks, split and batches: equal for the models of a repeat.
+        seed_weights: of the initial weights.
+    """
+
+    model: str
+    repeat: int
+    epochs: int
+    seed_draw: int
+    seed_weights: int
+
+    @property
+    def run_id(self) -> str:
+        """Name of the run, of its folder too: `ode_rnn-r04`."""
+        return f"{self.model}-r{self.repeat:02d}"
+
+
+@dataclass(frozen=True)
+class SweepPlan(Plan):
+    """Models over repeats on one data set.
+
+    Attributes:
+        choices: label, config and training of each model.
+        repeats: how many; repeat i has the seeds of `split` plus i.
+        split: windows, masks and split.
+        scaler_kind: fitted on the training part of a repeat.
+    """
+
+    grows: ClassVar[bool] = True
+
+    choices: tuple[tuple[str, ModelConfig, TrainConfig], ...]
+    repeats: int
+    split: SplitConfig
+    scaler_kind: str = "standardise"
+
+    def runs(self) -> tuple[Run, ...]:
+        """Repeat by repeat, so that a part of a sweep can be compared."""
+        seeds = [(i, self.split.seed + i) for i in range(self.repeats)]
+        return tuple(
+            SweepRun(label, i, training.epochs, seed, seed)
+            for i, seed in seeds
+            for label, _, training in self.choices
+        )
+
+    def settings(self) -> Mapping[str, Any]:
+        """Split and scaler."""
+        return {"split": asdict(self.split), "scaler": self.scaler_kind}
+
+    def models(self) -> Mapping[str, Any]:
+        """Config and training of each model."""
+        return {
+            f"model {label}": {"model": asdict(model), "training": asdict(training)}
+            for label, model, training in self.choices
+        }
+
+    def simulate(self, *, progress: bool) -> Dataset:
+        """A sweep has no trajectories of its own."""
+        raise InputError("a sweep needs a data set; give dataset=")
+
+    def parts(self, recorded: Dataset, run: Run) -> Parts:
+        """As `apply_split`, with the seed of the repeat."""
+        return apply_split(recorded, replace(self.split, seed=run.seed_draw))
+
+    def scaler(self, recorded: Dataset, train: Dataset) -> Scaler:
+        """Fitted on the training part."""
+        return Scaler.fit(self.scaler_kind, train)
+
+    def model_config(self, label: str) -> ModelConfig:
+        """As it was given."""
+        return next(model for name, model, _ in self.choices if name == label)
+
+    def train_config(self, run: Run) -> TrainConfig:
+        """As it was given, with the seed of the repeat."""
+        training = next(training for name, _, training in self.choices if name == run.model)
+        return replace(training, seed=run.seed_draw)
+
+    def provenance(self) -> dict[str, str]:
+        """Of this process, as it stood when it was first asked."""
+        return _provenance()
+
+    def columns(self, run: Run, model: Model, test: Dataset, recorded: Dataset) -> dict[str, Any]:
+        """The condition, which is the same for all runs."""
+        split = self.split
+        window = split.window if split.window_s is None else f"{split.window_s:g} s"
+        said = [] if window is None else [f"window {window}"]
+        if split.observed_fraction is not None:
+            said.append(f"observed_fraction {split.observed_fraction:g}")
+        return {"condition": ", ".join(said) or "whole trajectories"}
+
+
+@cache
+def _provenance() -> dict[str, str]:
+    return provenance(fingerprint())
+
+
+def sweep(
+    dataset: Dataset,
+    models: Sequence[str | ModelConfig] | Mapping[str, str | ModelConfig],
+    *,
+    out: str | Path,
+    repeats: int = 5,
+    split: SplitConfig = SplitConfig(),  # noqa: B008  # frozen
+    training: TrainConfig | Mapping[str, TrainConfig] | None = None,
+    epochs: int | None = None,
+    scaler: str = "standardise",
+    engine: str = "local",
+    processes: int | None = None,
+    threads: int = 1,
+    budget_minutes: float | None = None,
+    mixed: str = "refuse",
+    engine_options: Mapping[str, Any] | None = None,
+    progress: bool = True,
+) -> SweepResult:
+    """Trains and scores models over repeats on any data, and keeps a record of all runs.
+
+    In repeat i, every model is trained on the windows, masks and split that seed `split.seed + i`
+    draws, so that `compare` can pair them. Killed at any moment, the same call goes on where it was
+    and ends with the same numbers. A folder can be gone on with more models and more repeats.
+
+    Args:
+        dataset: the trajectories.
+        models: names of the zoo or configs; a mapping gives them labels of their own.
+        out: folder: `record.parquet` and `.csv` (a line per run, the last-value predictor's scores
+            among them), `curves.*` (a line per epoch), `status.json`, `data/`, `runs/`.
+        repeats: how many.
+        split: windows, masks and split; its seed is that of the first repeat.
+        training: of all models, or by label; by default the recipe of each model.
+        epochs: replaces those of `training`.
+        scaler: `standardise`, `min_max`, `divide_by_max` or `identity`, fitted on the training part
+            of each repeat.
+        engine: `local`, `ray` or `slurm`; all give the same numbers. The workers of a cluster must
+            see `out` under the same path.
+        processes: runs at a time; by default as many as cores and memory allow.
+        threads: of each run.
+        budget_minutes: stop after so long, in the middle of runs; they go on next time.
+        mixed: what to do with runs in `out` that were made by other code, on another processor,
+            with another backend, torch or data: `refuse` to go on, `accept` or `redo` them.
+        engine_options: arguments of `ray.init`, or of submitit's `update_parameters`.
+        progress: show how far it is on standard error.
+
+    Returns:
+        The record; its `compare` says which models differ.
+
+    Raises:
+        InputError: an argument is wrong, `out` belongs to another sweep or is in use, or runs would
+            be mixed.
+        DivergenceError: a training left the finite numbers; all other runs were done.
+        OffbeatError: a run failed otherwise, or lost its process three times.
+
+    Example:
+        >>> done = sweep(dataset, ["gru_d", "ode_rnn"], out="runs/sweep")  # doctest: +SKIP
+        >>> print(done.compare().text())  # doctest: +SKIP
+    """
+    plan = SweepPlan(_choices(models, training, epochs), repeats, split, scaler)
+    one_of("scaler", scaler, SCALERS)
+    if not isinstance(repeats, int) or not 1 <= repeats <= 100:
+        raise InputError(f"repeats must be an integer from 1 to 100, got {repeats!r}")
+    check_seed(split.seed + repeats)
+    return run_plan(
+        plan,
+        out,
+        dataset,
+        engine=engine,
+        mixed=mixed,
+        processes=processes,
+        threads=threads,
+        budget_minutes=budget_minutes,
+        engine_options=engine_options,
+        progress=progress,
+    )
+
+
+def _choices(
+    models: Sequence[str | ModelConfig] | Mapping[str, str | ModelConfig],
+    training: TrainConfig | Mapping[str, TrainConfig] | None,
+    epochs: int | None,
+) -> tuple[tuple[str, ModelConfig, TrainConfig], ...]:
+    configs = [ModelConfig(m) if isinstance(m, str) else m for m in _values(models)]
+    labels = list(models) if isinstance(models, Mapping) else [c.name for c in configs]
+    if not labels or len(set(labels)) < len(labels):
+        raise InputError(
+            f"models need labels that differ, got {', '.join(labels) or 'no model'}; give "
+            "a mapping from label to config for several of one name"
+        )
+    for label in labels:
+        if not label.replace("_", "").replace("-", "").replace(".", "").isalnum():
+            raise InputError(
+                f"the label {label!r} names a folder; use letters, digits, '_', '-' and '.'"
+            )
+    by_label = training if isinstance(training, Mapping) else {}
+    for label in by_label:
+        one_of("label of training", label, labels)
+    found = []
+    for label, config in zip(labels, configs, strict=True):
+        own = by_label.get(label) if training is None or by_label else training
+        own = own if isinstance(own, TrainConfig) else train_config(config.name)
+        found.append((label, config, own if epochs is None else replace(own, epochs=epochs)))
+    return tuple(found)
+
+
+def _values(
+    models: Sequence[str | ModelConfig] | Mapping[str, str | ModelConfig],
+) -> list[str | ModelConfig]:
+    return list(models.values()) if isinstance(models, Mapping) else list(models)
