@@ -466,7 +466,7 @@ def test_folders_are_paired_by_the_cut_of_the_data_and_sizes_are_told_apart(runs
     found = compare(runs, resamples=200)
     (condition,) = found.conditions
     assert condition.condition == "hopper.parquet, window 20, observed_fraction 0.5"
-    assert condition.repeats == ("parts.seed 0", "parts.seed 1", "parts.seed 2")
+    assert condition.repeats == ("split.seed 0", "split.seed 1", "split.seed 2")
     assert {s.model for s in condition.summaries} == {
         "gru[hidden_size=3]", "gru[hidden_size=4]", "rnn", "last_value",
     }  # fmt: skip
@@ -480,7 +480,7 @@ def test_folders_are_paired_by_the_cut_of_the_data_and_sizes_are_told_apart(runs
 
 def test_runs_on_one_cut_are_paired_by_their_seeds_and_it_is_told(runs, tmp_path):
     one = read_runs([runs / "gru-4-0", runs / "rnn-4-0"])
-    assert {run.repeat for run in one} == {"parts.seed 0"}
+    assert {run.repeat for run in one} == {"split.seed 0"}
     copies = []
     for name in ("gru", "rnn"):
         for seed in range(3):
@@ -498,7 +498,7 @@ def test_runs_on_one_cut_are_paired_by_their_seeds_and_it_is_told(runs, tmp_path
             (folder / "results.json").write_text(json.dumps(results))
             copies.append(folder)
     found = compare([*copies[:2], copies[2], *copies[3:]], resamples=200)
-    assert found.conditions[0].repeats == tuple(f"parts.seed 0 / seed {i}" for i in range(3))
+    assert found.conditions[0].repeats == tuple(f"split.seed 0 / seed {i}" for i in range(3))
     assert any("share one draw of windows and masks" in note for note in found.notes)
 
 

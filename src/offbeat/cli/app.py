@@ -22,6 +22,7 @@ from offbeat.cli.inspect import inspect_command
 from offbeat.cli.predict import predict_command
 from offbeat.cli.simulate import simulate_command
 from offbeat.cli.stream import stream_command
+from offbeat.cli.sweep import sweep_command
 from offbeat.cli.train import train_command
 from offbeat.errors import OffbeatError
 
@@ -49,6 +50,7 @@ COMMANDS: dict[str, Any] = {
     "evaluate": evaluate_command,
     "predict": predict_command,
     "compare": compare_command,
+    "sweep": sweep_command,
     "stream": stream_command,
     "export": export_command,
     "impute": impute_command,

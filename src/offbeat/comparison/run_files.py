@@ -17,8 +17,23 @@ METRICS = ("after_first_observation", "masked", "after_first_row", "published")
 LAST_VALUE = "last_value"
 """Name of the trivial predictor that is scored beside every run."""
 
-PROVENANCE = ("commit", "bits", "cpu", "kernel_body", "torch")
+_OLD = {
+    "after_first_observation": "honest",
+    "masked": "honest_hidden",
+    "after_first_row": "rows_1_99",
+    "scan_backend": "kernel_body",
+    "split": "parts",
+}
+"""Names that version 0.1.0 wrote, and that the record of the thesis keeps."""
+
+PROVENANCE = ("commit", "bits", "cpu", "scan_backend", "torch")
 """What runs that are compared should have in common; where they have not, it is said."""
+
+_NEW = {
+    **{f"{old}_mse": f"{name}_mse" for name, old in _OLD.items()},
+    **{f"last_value_{old}_mse": f"last_value_{name}_mse" for name, old in _OLD.items()},
+    "kernel_body": "scan_backend",
+}
 
 _CONDITION = ("condition", "data", "experiment", "observed_fraction")
 _NOT_SETTINGS = ("seed", "checkpoint_every")
@@ -89,10 +104,11 @@ def _read_folder(folder: Path) -> RawRun:
     config = _load(folder / "config.yaml", yaml.safe_load)
     results = _load(folder / "results.json", json.loads)
     try:
-        model, parts, training = config["model"], dict(config["split"]), config["training"]
+        model, training = config["model"], config["training"]
+        split = dict(_named(config, "split"))
         scores, name = results["predictors"], str(model["name"])
-        draw = str(parts.pop("seed"))
-        condition = {"data": Path(config["data"]).name, **parts, "scaler": config["scaler"]}
+        draw = str(split.pop("seed"))
+        condition = {"data": Path(config["data"]).name, **split, "scaler": config["scaler"]}
         fingerprint = folder / "split.json"
         if fingerprint.is_file():
             condition["fingerprint"] = str(_load(fingerprint, json.loads)["data"])
@@ -111,17 +127,22 @@ def _read_folder(folder: Path) -> RawRun:
                 k for k in ("data", "window", "observed_fraction") if condition.get(k) is not None
             ),
             settings,
-            (f"parts.seed {draw}", f"seed {config['seed']}"),
+            (f"split.seed {draw}", f"seed {config['seed']}"),
             facts,
-            {metric: _mse(scores[name][metric]) for metric in METRICS},
-            {metric: _mse(scores[LAST_VALUE][metric]) for metric in METRICS},
+            {metric: _mse(_named(scores[name], metric)) for metric in METRICS},
+            {metric: _mse(_named(scores[LAST_VALUE], metric)) for metric in METRICS},
             draw,
-            {key: str(results[key]) for key in PROVENANCE if key in results},
+            {},
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise FileFormatError(
             f"{folder} is no run of 'offbeat train' ({type(error).__name__}: {error}); train again"
         ) from None
+
+
+def _named(values: Mapping[str, Any], name: str) -> Any:
+    """A value by its name, or by the name that version 0.1.0 gave it."""
+    return values[name] if name in values else values[_OLD.get(name, name)]
 
 
 def _load(path: Path, parse: Callable[[str], Any]) -> Any:
@@ -142,7 +163,7 @@ def _mse(score: Mapping[str, Any]) -> float:
 
 
 def _read_table(path: Path) -> list[RawRun]:
-    rows = _rows(path)
+    rows = [{_NEW.get(name, name): value for name, value in row.items()} for row in _rows(path)]
     columns = set(rows[0]) if rows else set()
     metrics = [metric for metric in METRICS if f"{metric}_mse" in columns]
     missing = [name for name in ("model", "repeat") if name not in columns]
@@ -185,7 +206,7 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     import pyarrow.csv
     import pyarrow.parquet
 
-    text = ("run_id", "model", "condition", "data", "repeat", *PROVENANCE)
+    text = ("run_id", "model", "condition", "data", "repeat", *PROVENANCE, "kernel_body")
     try:
         if path.suffix.lower() == ".parquet":
             table = pyarrow.parquet.read_table(path, memory_map=False)

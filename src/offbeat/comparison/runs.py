@@ -50,10 +50,10 @@ def read_runs(
     that seed, the seed of the weights tells them apart. Runs of one name under one condition whose
     settings differ get the settings into their label: `gru[hidden_size=32]`.
 
-    A table has a row per run, with columns `model`, `repeat` and `<metric>_mse` (`after_first_observation_mse`,
-    ...), and as far as there are any `run_id`, `condition`, `data`, `experiment`,
+    A table has a row per run, with columns `model`, `repeat` and `<metric>_mse` (such as
+    `masked_mse`), and as far as there are any `run_id`, `condition`, `data`, `experiment`,
     `observed_fraction`, `seed_draw`, `last_value_<metric>_mse`, `commit`, `bits`, `cpu`,
-    `kernel_body`, `torch`.
+    `scan_backend`, `torch`. Names that version 0.1.0 wrote are read as well.
 
     Args:
         paths: of folders of runs, of folders that hold such folders or a `record.parquet` or

@@ -10,9 +10,7 @@ import platform
 import subprocess
 from pathlib import Path
 
-import offbeat
-
-PACKAGE = Path(offbeat.__file__).parent
+PACKAGE = Path(__file__).parents[1]
 
 
 def provenance(bits: str) -> dict[str, str]:

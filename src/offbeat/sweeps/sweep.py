@@ -156,7 +156,8 @@ def sweep(
             among them), `curves.*` (a line per epoch), `status.json`, `data/`, `runs/`.
         repeats: how many.
         split: windows, masks and split; its seed is that of the first repeat.
-        training: of all models, or by label; by default the recipe of each model.
+        training: of all models, or by label; by default the recipe of each model, with the
+            weights of the best validation error.
         epochs: replaces those of `training`.
         scaler: `standardise`, `min_max`, `divide_by_max` or `identity`, fitted on the training part
             of each repeat.
@@ -225,7 +226,7 @@ def _choices(
     found = []
     for label, config in zip(labels, configs, strict=True):
         own = by_label.get(label) if training is None or by_label else training
-        own = own if isinstance(own, TrainConfig) else train_config(config.name)
+        own = own if isinstance(own, TrainConfig) else train_config(config.name, keep="best")
         found.append((label, config, own if epochs is None else replace(own, epochs=epochs)))
     return tuple(found)
 
