@@ -557,7 +557,7 @@ def test_the_command_draws_the_diagram(record, tmp_path, capsys):
         (["--only", "experiment"], "expected name=value"),
         (
             ["--models", "[gru, ode_rnn]", "--figure", "a.png"],
-            "three or more models; leave figure out",
+            "three or more models; leave out --figure",
         ),
         (["nowhere"], "nowhere is not there"),
     ],
