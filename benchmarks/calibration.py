@@ -6,7 +6,7 @@
 Data, windows, masks, split, normalisation, models and training follow chapter 3 of the thesis: the
 draw of the public generator (seed 123), a window of 100 of 200 rows per trajectory,
 `divide_by_max` over all rows, 70/15/15 by trajectory, batches of 50. The anchored model trains with
-its own optimizer (`offbeat.train_config`). A killed run goes on where it was.
+its own optimizer (`offbeat.train_config`). An interrupted run continues when it is started again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from offbeat.files import write_json
 def protocol_data(
     observed_fraction: float, *, n_trajectories: int = 10_000, seed: int = 0
 ) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset, ob.Scaler]:
-    """Training, validation and test part, and the scaler measured on everything."""
+    """Training, validation and test set, and the scaler fitted on everything."""
     recorded = ob.simulate("hopper", n_trajectories, 200, seed=123)
     scaler = ob.Scaler.fit("divide_by_max", recorded)
     masked = ob.mask_out(ob.windows(recorded, 100, seed=seed), observed_fraction, seed=seed)
@@ -45,21 +45,21 @@ def run(
     clock: str = "first_row",
     out: Path = Path("runs/calibration"),
 ) -> None:
-    """Trains one model of the protocol and scores it on the test part.
+    """Trains one model of the protocol and scores it on the test set.
 
     Args:
         model: id of the model.
-        observed_fraction: share of the rows observed.
+        observed_fraction: fraction of the rows that are observed.
         epochs: to train.
         seed: of windows, masks, split, weights and batches.
         n_trajectories: 10,000 in the protocol.
         threads: of torch.
-        clock: when the state of a thesis model begins to move: first_row, as the thesis has it, or
-            first_observation, the default elsewhere.
+        clock: when the state of a thesis model begins to change: `first_row`, as in the thesis, or
+            `first_observation`, the default of other models.
         out: folder; the run goes to a subfolder of it.
     """
     torch.set_num_threads(threads)
-    machine = _machine(threads)  # now: a checkout may move on while this runs
+    machine = _machine(threads)  # before the run, which may outlast this commit
     train, validation, test, scaler = protocol_data(
         observed_fraction, n_trajectories=n_trajectories, seed=seed
     )
@@ -114,6 +114,16 @@ def _processor() -> str:
     return platform.processor()
 
 
+def _scores(predictor: dict[str, Any]) -> dict[str, Any]:
+    """The scores of a predictor under the names of today; files of 0.1.0 have others."""
+    old = {
+        "honest": "after_first_observation",
+        "honest_hidden": "masked",
+        "rows_1_99": "after_first_row",
+    }
+    return {old.get(name, name): score for name, score in predictor.items()}
+
+
 def table(folder: Path) -> None:
     """Prints a Markdown table of the results in a folder.
 
@@ -121,24 +131,27 @@ def table(folder: Path) -> None:
         folder: holds JSON files that `run` wrote as `result.json`, under any name.
     """
     titles = (
-        "run", "honest MSE (RMSE)", "hidden rows only, RMSE", "rows 1-99 MSE", "published RMSE",
-        "last value, honest RMSE", "ratio", "training", "commit",
+        "run", "MSE after the first observation (RMSE)", "masked values, RMSE", "rows 1-99 MSE",
+        "published RMSE", "last value, RMSE", "ratio", "training", "commit",
     )  # fmt: skip
     print("| " + " | ".join(titles) + " |\n" + "|---" * len(titles) + "|")
     for path in sorted(folder.glob("*.json")):
         result = json.loads(path.read_text(encoding="utf-8"))
         predictors = result["scores"]["predictors"]
-        ours, trivial = predictors[result["model"]], predictors["last_value"]
-        honest = ours["after_first_observation"]
-        share = round(100 * result["observed_fraction"])
+        ours, trivial = (_scores(predictors[name]) for name in (result["model"], "last_value"))
+        late, trivial_rmse = (
+            ours["after_first_observation"],
+            trivial["after_first_observation"]["rmse"],
+        )
+        percent = round(100 * result["observed_fraction"])
         cells = (
-            f"{path.stem}: {result['model']}, {share} %, {result['epochs']} epochs",
-            f"{honest['mse']:.6f} ({honest['rmse']:.4f})",
+            f"{path.stem}: {result['model']}, {percent} %, {result['epochs']} epochs",
+            f"{late['mse']:.6f} ({late['rmse']:.4f})",
             f"{ours['masked']['rmse']:.4f}",
             f"{ours['after_first_row']['mse']:.5f}",
             f"{ours['published']['rmse']:.4f}",
-            f"{trivial['honest']['rmse']:.4f}",
-            f"{honest['rmse'] / trivial['honest']['rmse']:.3f}",
+            f"{trivial_rmse:.4f}",
+            f"{late['rmse'] / trivial_rmse:.3f}",
             f"{result['steps']} steps, {result['training_seconds'] / 60:.0f} min",
             result["machine"]["commit"],
         )

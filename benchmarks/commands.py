@@ -1,4 +1,4 @@
-"""Wall time of the commands whose time is promised: `offbeat --help`, and the simulation.
+"""Wall time of `offbeat --help` and of the simulation.
 
 python benchmarks/commands.py
 """

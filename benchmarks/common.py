@@ -1,4 +1,4 @@
-"""What the benchmarks share: data of the protocol's shape, and what machine this is."""
+"""What the benchmarks share: data of the protocol's shape, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from offbeat.sweeps.provenance import commit, cpu
 def synthetic(
     n: int, rows: int, *, observed_fraction: float, channels: int = 14, seed: int = 0
 ) -> ob.Dataset:
-    """Random walks on a grid of 5 ms, whole rows hidden: the protocol's shape without MuJoCo."""
+    """Random walks on a grid of 5 ms, whole rows masked: the protocol's shape without MuJoCo."""
     rng = np.random.default_rng(seed)
     made = []
     for _ in range(n):
         values = 0.05 * np.cumsum(rng.normal(size=(rows, channels)), axis=0)
         observed = np.zeros((rows, channels), dtype=bool)
-        seen = rng.choice(rows, max(1, int(rows * observed_fraction)), replace=False)
-        observed[seen] = True
+        chosen = rng.choice(rows, max(1, int(rows * observed_fraction)), replace=False)
+        observed[chosen] = True
         made.append(ob.Trajectory(np.arange(rows) * 0.005, values, observed))
     return ob.Dataset(tuple(made))
 
 
 def machine() -> dict[str, Any]:
-    """Where and with what a benchmark ran."""
+    """The machine and the versions that a benchmark runs with."""
     found: dict[str, Any] = {
         "cpu": cpu(),
         "cores": os.cpu_count(),
@@ -52,12 +52,12 @@ def machine() -> dict[str, Any]:
 
 
 def kept(path: Path, name: str) -> Any:
-    """What an earlier call left under a name of its result, or None."""
+    """A named part of the result of an earlier call, or None."""
     return json.loads(path.read_text(encoding="utf-8"))[name] if path.exists() else None
 
 
 def write(path: str | None, result: dict[str, Any]) -> None:
-    """Writes a result as JSON, where a path is given."""
+    """Writes a result as JSON if a path is given."""
     if path is None:
         return
     Path(path).parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Wall time of a full-size epoch (7,000 trajectories; 1,500 to validate), and where it goes.
+"""Wall time of a full-size epoch (7,000 trajectories; 1,500 to validate) and of its compiled calls.
 
 python benchmarks/epoch.py --json results/benchmarks/epoch.json
 """
@@ -44,8 +44,7 @@ class Timed:
 def measure(name: str, data: ob.Dataset, validation: ob.Dataset, epochs: int) -> dict[str, Any]:
     """Wall time of an epoch with its validation, and the time of it within the compiled calls, s.
 
-    Medians over the epochs of one training but the first, in which much is touched for the first
-    time.
+    Medians over the epochs of one training, without the first, which also warms caches up.
     """
     config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
     model = ob.make_model(config, data, seed=0)
@@ -66,11 +65,11 @@ def measure(name: str, data: ob.Dataset, validation: ob.Dataset, epochs: int) ->
         cpu.compiled, training._close_epoch = timed.module, close
     spent = [{k: b[k] - a[k] for k in a} for a, b in itertools.pairwise(ends)]
     each = {key: statistics.median(epoch[key] for epoch in spent) for key in spent[0]}
-    shares = [sum(epoch[call] for call in CALLS) / epoch["wall"] for epoch in spent]
+    fractions = [sum(epoch[call] for call in CALLS) / epoch["wall"] for epoch in spent]
     return {
         "epoch_s": round(each["wall"], 2),
         "kernel_s": round(sum(each[call] for call in CALLS), 2),
-        "kernel_share": round(statistics.median(shares), 3),
+        "kernel_fraction": round(statistics.median(fractions), 3),
         "first_epoch_and_preparation_s": round(ends[0]["wall"] - began, 2),
         "calls_s": {call: round(each[call], 2) for call in CALLS},
     }

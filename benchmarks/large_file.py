@@ -1,12 +1,12 @@
-"""Reading a file that is larger than what a reader may hold beside the data set: 10 GB by default.
+"""Reading a file that does not fit into memory beside the data set: 10 GB by default.
 
     python benchmarks/large_file.py --json results/benchmarks/large_file.json
     python benchmarks/large_file.py --format parquet --gigabytes 2 --episodes 20
 
-The file (30 channels, a clock in nanoseconds, one cell in twenty missing) is written chunk by chunk
-into a temporary folder, and read by `offbeat.read` in processes of their own: all of it, and three
-of its channels. Each says the bytes of its data set's arrays and its peak of resident memory
-(`getrusage`), of which the interpreter and the libraries are a part that is told apart.
+The file (30 channels, a clock in nanoseconds, one value in twenty missing) is written in chunks
+into a temporary folder. `offbeat.read` reads all of it, and three of its channels, each in a new
+process. Each reports the bytes of its data set's arrays, and its peak resident memory (`getrusage`)
+with and without that of the interpreter and the libraries.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import Any
 CHUNK = 100_000  # rows
 FEW = ["joint_3", "joint_11", "joint_29"]
 
-# The peak of a process counts from that of the process that starts it, which so must stay small:
-# whatever imports more than the standard library is done in processes of its own.
+# The peak of a process starts at that of its parent, so the parent imports the standard library
+# only; everything else runs in new processes.
 READ = """
 import json, resource, sys, time
 import pyarrow.csv, pyarrow.parquet
@@ -80,13 +80,13 @@ def write_file(path: Path, size: int, channels: int, episodes: int) -> None:
 
 
 def own_process(*command: str) -> str:
-    """What a process prints."""
+    """The output of a new process."""
     done = subprocess.run([sys.executable, *command], stdout=subprocess.PIPE, text=True, check=True)
     return done.stdout
 
 
 def main() -> None:
-    """Prints a table, and writes JSON where a path is given."""
+    """Prints a table, and writes JSON if a path is given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--gigabytes", type=float, default=10.0)
     parser.add_argument("--format", choices=("csv", "parquet"), default="csv")

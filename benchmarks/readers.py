@@ -2,9 +2,9 @@
 
     python benchmarks/readers.py [--rows 1000000] [--channels 30] [--repeats 3] [--out FILE]
 
-The file is written once, with a clock in nanoseconds and one cell in twenty missing; each way is
-timed in turns, wall and CPU seconds, medians and the least. Beside it stands pyarrow alone, which
-makes columns of its own and no trajectory.
+The file is written once, with a clock in nanoseconds and one value in twenty missing. The readers
+take turns; wall and CPU seconds, medians and minima. pyarrow alone, which makes columns and no
+trajectories, is timed for comparison.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def write(folder: Path, rows: int, channels: int) -> dict[str, Path]:
 
 
 def main() -> None:
-    """Prints a table, and writes JSON where a path is given."""
+    """Prints a table, and writes JSON if a path is given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--channels", type=int, default=30)

@@ -1,9 +1,9 @@
-"""Reading ROS bags, beside rosbags alone: its iteration, and its iteration and deserialisation.
+"""Reading ROS bags, compared with rosbags alone: iteration, and iteration with deserialisation.
 
     python benchmarks/ros_reader.py [BAG ...] [--messages 30000] [--json]
 
 Without a bag, one of each format is written: two thirds IMU messages, one third joint states of 12
-joints. All topics are read. The ways take turns; CPU seconds, medians.
+joints. All topics are read. The readers take turns; CPU seconds, medians.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ WAYS: dict[str, Callable[[Path], Any]] = {
     "recordings": lambda path: list(ros.recordings(path)),
     "read": lambda path: read(path, max_gap_s=None),
 }
-"""`recordings` is the reader alone, `read` makes a data set of what it gives."""
+"""`recordings` is the reader alone; `read` makes a data set of its result."""
 
 
 def measure(path: Path, repeats: int) -> dict[str, float]:

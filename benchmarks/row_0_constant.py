@@ -1,11 +1,11 @@
-"""What another draw of initial states does to the units of the thesis' scores.
+"""How the units of the thesis' scores depend on the draw of initial states.
 
     python benchmarks/row_0_constant.py --draws 12 --out results/benchmarks/row_0_constant.json
 
-`divide_by_max` divides by the largest single frame of a channel, so its units, and with them c, the
-mean square of row 0, and every error, follow from a handful of frames. For each draw of 10,000
-initial states: c, and the RMSE of repeating the last observed value, which no training can move.
-The first draw is the protocol's own.
+`divide_by_max` divides by the largest value of a channel, so its units, c (the mean square of row
+0) and every error depend on a few rows. For each draw of 10,000 initial states: c, and the RMSE of
+repeating the last observed value, which does not depend on training. The first draw is the
+protocol's own.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def measured(protocol: Protocol) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measures the draws that are missing, and prints all."""
+    """Measures the missing draws, and prints all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=12)
     parser.add_argument("--out", type=Path, default=Path("results/benchmarks/row_0_constant.json"))
@@ -58,7 +58,7 @@ def main() -> None:
             write(str(arguments.out), {"machine": machine(), "draws": done})
     for draw in done:
         shown = "  ".join(
-            f"{float(p):.0%} {scores['published']:.4f} ({scores['honest']:.4f})"
+            f"{float(p):.0%} {scores['published']:.4f} ({scores['after_first_observation']:.4f})"
             for p, scores in draw["last_value"].items()
         )
         print(f"seed {draw['state_seed']:4}  c {draw['c']:.3f}  last value {shown}")

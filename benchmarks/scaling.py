@@ -1,8 +1,8 @@
-"""How the cost of a scan, forward and backward, grows with what it is given.
+"""How the cost of a scan, forward and backward, grows with its sizes.
 
-Each sweep changes one thing and keeps the rest at the protocol's size (batch 50, 100 rows, 14
-channels, hidden 15, a vector field of four layers of 100 units); its points take turns. A cost that
-grows in proportion has `per_unit` 1 all along.
+Each sweep changes one size and keeps the rest at the protocol's (batch 50, 100 rows, 14 channels,
+hidden 15, a vector field of four layers of 100 units). The points of a sweep take turns. A cost in
+proportion to the size has `per_unit` 1 everywhere.
 
     python benchmarks/scaling.py --json results/benchmarks/scaling.json
 """
@@ -20,7 +20,7 @@ import torch
 from common import machine, synthetic, write
 
 import offbeat as ob
-from offbeat.kernels import cpu as fused
+from offbeat.kernels import cpu
 from offbeat.training import Examples, threads_for
 
 BASE: dict[str, Any] = {"batch": 50, "rows": 100, "hidden": 15, "units": 100, "observed": 0.3}
@@ -34,7 +34,7 @@ SWEEPS: dict[str, list[Any]] = {
 
 
 def ragged(n: int, rows: int, seed: int = 0) -> ob.Dataset:
-    """Each trajectory has 30 rows at times of its own; together they have hundreds."""
+    """Trajectories with different times, whose union has hundreds of rows."""
     rng = np.random.default_rng(seed)
     made = []
     for _ in range(n):
@@ -66,7 +66,7 @@ def point(name: str, **changed: Any) -> Callable[[], None]:
 
 
 def in_turn(steps: dict[Any, Callable[[], None]], repeats: int) -> dict[Any, float]:
-    """Median time of each, ms; they take turns."""
+    """Median time of each step, ms; the steps take turns."""
     for step in steps.values():
         step()
     times: dict[Any, list[float]] = {key: [] for key in steps}
@@ -82,14 +82,14 @@ def under(step: Callable[[], None], **settings: int) -> Callable[[], None]:
     """The same step under other settings of the compiled backend: `TAPE_LIMIT`, `ROWS_AT_ONCE`."""
 
     def changed() -> None:
-        kept = {name: getattr(fused, name) for name in settings}
+        kept = {name: getattr(cpu, name) for name in settings}
         try:
             for name, value in settings.items():
-                setattr(fused, name, value)
+                setattr(cpu, name, value)
             step()
         finally:
             for name, value in kept.items():
-                setattr(fused, name, value)
+                setattr(cpu, name, value)
 
     return changed
 
@@ -118,23 +118,23 @@ def main() -> None:
     times = in_turn(
         {
             "30 rows on one grid": point(options.model, rows=30),
-            "30 rows, each at its own times": step_of(own, options.model),
+            "30 rows at different times": step_of(own, options.model),
         },
         options.repeats,
     )
-    found["own time grids"] = {"rows of the union": union, **times}
-    print(f"own grids  {times}, rows of the union: {union}")
+    found["different times"] = {"rows of the union": union, **times}
+    print(f"different times: {times}, rows of the union: {union}")
     step = point(options.model)
     times = in_turn(
         {
             "stored": under(step, TAPE_LIMIT=2**60),
-            "computed again": under(step, TAPE_LIMIT=0),
+            "recomputed": under(step, TAPE_LIMIT=0),
         },
         options.repeats,
     )
     found["inner activations"] = times
     print(f"inner activations: {times}")
-    # At the end: all products of activations and their gradients in one go, after all rows.
+    # "at the end": one product of all activations and gradients, after all rows.
     ways = {f"every {n} rows": under(step, ROWS_AT_ONCE=n) for n in (1, 2, 4, 8, 16, 32)}
     ways["at the end"] = under(step, ROWS_AT_ONCE=BASE["rows"])
     times = in_turn(ways, options.repeats)

@@ -1,10 +1,10 @@
-"""Latency and memory of a live stream, step by step, beside the exported step on onnxruntime.
+"""Latency and memory of a live stream, compared with the exported step on onnxruntime.
 
     python benchmarks/stream_live.py
     python benchmarks/stream_live.py --steps 10000000 --models anchored_ode_gru_d --json
 
-A step is one message of 14 channels, 30 % of them measured, at uneven times, with the default
-policies: `observe`, then `predict` 10 ms ahead. One thread. Models of the zoo's own size, with
+A step is one message of 14 channels, of which 30 % have values, at uneven times, with the default
+options: `observe`, then `predict` 10 ms ahead. One thread; the models have the sizes of the zoo and
 initial weights.
 """
 
@@ -32,8 +32,8 @@ CHANNELS = 14
 WARM_UP = 1000
 
 
-def training_part(seed: int = 0) -> ob.Dataset:
-    """Random walks on a 5 ms grid: what scales and gaps are measured on."""
+def training_set(seed: int = 0) -> ob.Dataset:
+    """Random walks on a 5 ms grid, from which scales and gaps are measured."""
     random = np.random.default_rng(seed)
     walks = random.normal(size=(20, 100, CHANNELS)).cumsum(axis=1)
     return ob.mask_out(
@@ -42,7 +42,7 @@ def training_part(seed: int = 0) -> ob.Dataset:
 
 
 def messages(count: int, seed: int = 1) -> tuple[Any, Any]:
-    """Gaps in ns and partial rows, used round and round."""
+    """Gaps in ns and partly observed rows, used cyclically."""
     random = np.random.default_rng(seed)
     values = random.normal(size=(count, CHANNELS))
     values[random.random(values.shape) > 0.3] = np.nan
@@ -58,7 +58,7 @@ def resident_mib() -> float:
 def measure(stream: LiveStream, steps: int) -> dict[str, Any]:
     """Runs a stream; latencies in us."""
     gaps, rows = messages(4096)
-    taken = np.full((2, steps), -1, dtype=np.int64)  # written to, so that it is resident
+    taken = np.full((2, steps), -1, dtype=np.int64)  # filled, so that it is resident
     clock, t, before = time.perf_counter_ns, 1_700_000_000_000_000_000, 0.0
     for i in range(-WARM_UP, steps):
         if i == 0:
@@ -87,8 +87,8 @@ def measure(stream: LiveStream, steps: int) -> dict[str, Any]:
 
 
 def engines(name: str, folder: str) -> dict[str, Callable[[], LiveStream]]:
-    """How to make a stream of each kind."""
-    model = ob.make_model(name, training_part())
+    """Constructors of both kinds of stream."""
+    model = ob.make_model(name, training_set())
     path = Path(folder) / f"{name}.onnx"
 
     def onnx() -> LiveStream:
@@ -107,7 +107,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    results: dict[str, Any] = {"body": kernels.backend()[0], "steps": options.steps, "models": {}}
+    results: dict[str, Any] = {
+        "backend": kernels.backend()[0],
+        "steps": options.steps,
+        "models": {},
+    }
     with tempfile.TemporaryDirectory() as folder:
         for name in options.models:
             made = engines(name, folder)
@@ -117,7 +121,7 @@ def main() -> None:
     if options.json:
         print(json.dumps(results, indent=2))
         return
-    print(f"{options.steps} steps; scan backend: {results['body']}\n")
+    print(f"{options.steps} steps; scan backend: {results['backend']}\n")
     print(
         "| model | engine | observe, median | 99.9 % | predict, median | 99.9 % | "
         "resident MiB, start | end |"

@@ -1,9 +1,8 @@
-"""What one row of a live stream costs, from the outside in.
+"""The latency of one row of a live stream.
 
-`stream` is the public `Stream.step`: the prediction of a row, then the row, policies and clock
-included; `observe` takes the row alone.
-`kernel` is the compiled call alone that takes a row in (ages, projections, decay, flow, cell), as
-Python sees it, so the binding is counted.
+`stream` is the public `Stream.step`: the prediction of a row, then the observation, with clock and
+options. `observe` is the observation alone. `kernel` is the compiled call of an observation alone
+(step inputs, projections, decay, dynamics, cell), with its Python binding.
 
     python benchmarks/streaming_step.py --json results/benchmarks/streaming_step.json
 """
@@ -40,7 +39,7 @@ def measure(name: str, data: ob.Dataset, steps: int) -> dict[str, Any]:
     model = ob.make_model(name, data, seed=0)
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(1000, model.channels))
-    rows[rng.random(1000) < 0.7] = np.nan  # 30 % of the rows bring something
+    rows[rng.random(1000) < 0.7] = np.nan  # 30 % of the rows have values
     gaps = rng.uniform(0.002, 0.02, size=1000)
     clock = time.perf_counter_ns
 
@@ -65,9 +64,9 @@ def measure(name: str, data: ob.Dataset, steps: int) -> dict[str, Any]:
         t = 0.0
         for i in range(-500, steps):
             t += float(gaps[i % 1000])
-            value, seen = values[i % 1000], mask[i % 1000]
+            value, observed = values[i % 1000], mask[i % 1000]
             start = clock()
-            live.observe(t, value, seen, False)
+            live.observe(t, value, observed, False)
             if i >= 0:
                 taken[i] = clock() - start
         result["kernel"] = spread(taken)

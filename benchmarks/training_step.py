@@ -1,7 +1,7 @@
-"""One training step (forward, backward, optimizer): ours, and the same architecture by others.
+"""One training step (forward, backward, optimizer) of Offbeat, eager PyTorch and JAX.
 
-All contestants take turns within one process, with the same threads, weights and batch, and must
-agree on the loss before they are timed.
+All implementations take turns within one process, with the same threads, weights and batch. They
+must agree on the loss before they are timed. `two_builds.py` compares two checkouts of Offbeat.
 
     python benchmarks/training_step.py --threads 2 --json results/benchmarks/training_step.json
 """

@@ -1,10 +1,10 @@
-"""How far the scores of a self-fed model move with its generator alone: same weights, same test part.
+"""How the scores of a model with self-feeding vary with the seed of its random generator alone.
 
-    offbeat reproduce --out runs/thesis --only experiment=1,model=gru,fraction=0.3
+    python -m thesis run --out runs/thesis --only experiment=1,model=gru,fraction=0.3
     python benchmarks/generator.py runs/thesis e1-gru-30-r00 --out results/benchmarks/generator.json
 
-Self-feeding draws one coin per row for the whole part that is scored, so a score is of one sequence
-of 100 generator, however many trajectories there are.
+The weights and the test set are the same. Self-feeding draws one random number per row for the
+whole test set, so a score belongs to one sequence of 100 draws, however many trajectories there are.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from thesis.protocol import Protocol
 
 
 def main() -> None:
-    """Scores the run's model with generator of many seeds."""
+    """Scores the model of a run with many seeds."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path, help="of a reproduction, with its checkpoints")
+    parser.add_argument(
+        "folder", type=Path, help="the output of `python -m thesis run`, with checkpoints"
+    )
     parser.add_argument("run_id")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--threads", type=int, default=1)
@@ -46,7 +48,7 @@ def main() -> None:
     write(str(arguments.out), {"machine": machine(), "runs": runs})
     for name, values in found.items():
         print(
-            f"{run.run_id}  {name} RMSE, generator of {len(values)} seeds: mean {np.mean(values):.4f}"
+            f"{run.run_id}  {name} RMSE over {len(values)} seeds: mean {np.mean(values):.4f}"
             f"  std {np.std(values, ddof=1):.4f}  from {min(values):.4f} to {max(values):.4f}"
         )
         for other in runs:
