@@ -5,8 +5,8 @@
 Experiment 2 of the protocol at one observed fraction and one repeat: the windows, masks, split,
 order of batches and initial weights of the recorded `gru_fair`, without self-feeding. The variants
 differ only in the rows at which the cell updates, its time input, and the unit of that
-(`update_rows`, `time_input` and `time_input_unit` of `ModelConfig`). Variants whose result is in the
-file are not trained again.
+(`update_rows`, `time_input` and `time_input_unit` of `ModelConfig`). A variant whose result is in
+the file is not trained again.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     python benchmarks/generator.py runs/thesis e1-gru-30-r00 --out results/benchmarks/generator.json
 
 The weights and the test set are the same. Self-feeding draws one random number per row for the
-whole test set, so a score belongs to one sequence of 100 draws, however many trajectories there are.
+whole test set, so a score belongs to one sequence of draws, however many trajectories there are.
 """
 
 from __future__ import annotations
