@@ -1,18 +1,22 @@
 """The command: what it prints, what it writes, and one clear line for every bad input."""
 
 import csv
+import importlib.metadata
 import json
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from packaging.requirements import Requirement
 
 import offbeat as ob
+from offbeat import doctor
 from offbeat.cli.app import COMMANDS, main, run_commands
 from offbeat.cli.option_groups import reader_options, training_options
 from offbeat.cli.parser import CommandParser
@@ -344,10 +348,28 @@ def test_options_of_the_run_hold_beside_those_that_are_given(run, stamped, tmp_p
     one_line_error(capsys, *predict, "--reader.format=csv")  # and no longer those of the run
 
 
-def test_doctor_says_what_is_installed(capsys):
+def test_doctor_names_every_declared_dependency_with_its_version(capsys):
     assert main(["doctor", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert {"offbeat", "python", "torch", "mujoco", "torch threads"} <= set(said)
+    assert {"offbeat", "python", "torch threads", "scan backend"} <= set(said)
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    declared = [*project["dependencies"]]
+    for extra, names in project["optional-dependencies"].items():
+        declared += names if extra not in ("test", "bench") else []
+    for text in declared:
+        name = Requirement(text).name
+        assert said[name] == importlib.metadata.version(name)
+
+
+def test_doctor_says_which_extra_brings_what_is_missing(monkeypatch):
+    monkeypatch.setattr("importlib.metadata.version", missing)
+    found = doctor.examine()
+    assert found["scipy"] == "missing"
+    assert found["mujoco"] == "missing; pip install 'offbeat[sim]'"
+
+
+def missing(name: str) -> str:
+    raise importlib.metadata.PackageNotFoundError(name)
 
 
 def test_bad_input_is_one_clear_line_and_exit_code_2(run, data, tmp_path, capsys):
@@ -483,3 +505,28 @@ def test_messages_of_the_library_name_options_as_they_are_typed(said, spoken):
     )
     parser.fill()
     assert parser.spoken(said) == spoken
+
+
+@pytest.mark.slow
+def test_a_training_without_options_follows_the_recipe_and_beats_the_last_value(tmp_path):
+    data, run = tmp_path / "hopper.parquet", tmp_path / "run"
+    assert main(["simulate", str(data), "--n_trajectories=1000", "--rows=60"]) == 0
+    assert main(["train", str(data), str(run)]) == 0
+    results = json.loads((run / "results.json").read_text())
+    assert results["steps"] <= 700
+    rmse = {
+        name: scores["after_first_observation"]["rmse"]
+        for name, scores in results["predictors"].items()
+    }
+    assert rmse["anchored_ode_gru_d"] < 0.8 * rmse["last_value"]
+    config = yaml.safe_load((run / "config.yaml").read_text())["training"]
+    recipe = ob.train_config("anchored_ode_gru_d", keep="best")
+    assert ob.TrainConfig(**config) == recipe
+    assert config["optimizer"] == "adam"
+
+
+def test_options_of_the_training_replace_those_of_the_recipe(data, tmp_path):
+    arguments = ["train", str(data), str(tmp_path), "--model.hidden_size=4", "--training.epochs=1"]
+    assert main([*arguments, "--training.learning_rate=0.01", "--training.keep=last"]) == 0
+    config = yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]
+    assert (config["learning_rate"], config["keep"], config["clip_norm"]) == (0.01, "last", 1.0)

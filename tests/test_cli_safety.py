@@ -1,4 +1,4 @@
-"""Configs come from other people: no option may run what a config names, or take all memory."""
+"""No option runs what a config names or takes all memory; completion knows every option."""
 
 from __future__ import annotations
 
@@ -114,8 +114,35 @@ def test_a_typed_value_that_is_no_value_ends_in_one_line(value, tmp_path, capsys
         assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
-def test_completion_knows_commands_options_and_choices(shell):
+COMPLETE = """
+source completion
+complete_line() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _shtab_offbeat; echo ${COMPREPLY[@]}; }
+complete_line offbeat ex
+complete_line offbeat train --split.obs
+complete_line offbeat train --two
+complete_line offbeat train a b --split.mask ''
+complete_line offbeat extrapolate --reader.time_u
+"""
+
+
+def test_bash_completes_commands_options_and_choices(tmp_path):
+    python = [sys.executable, "-m", "offbeat", "--print_completion=shtab-bash"]
+    script = subprocess.run(python, capture_output=True, text=True, check=True).stdout
+    (tmp_path / "completion").write_text(script)
+    found = subprocess.run(
+        ["bash", "-c", COMPLETE], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert found.stdout.splitlines() == [
+        "export extrapolate",
+        "--split.observed_fraction",
+        "--two_sided",
+        "rows values bursts dropout",
+        "--reader.time_unit",
+    ]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "tcsh"])
+def test_completion_of_other_shells_knows_commands_options_and_choices(shell):
     found = subprocess.run(
         [sys.executable, "-m", "offbeat", f"--print_completion=shtab-{shell}"],
         capture_output=True,

@@ -1,31 +1,23 @@
-"""What is installed and what runs: the first thing to look at when something is odd."""
+"""What is installed and what runs: the first place to look when something does not work."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import os
 import platform
+import re
 import sys
 from typing import Any
 
 from offbeat import __version__
 from offbeat.kernels import cpu
 
-CORE = ("torch", "numpy", "pyarrow", "safetensors", "jsonargparse", "matplotlib", "pillow")
-EXTRAS = {
-    "sim": ("mujoco", "dm_control"),
-    "track": ("tensorboard",),
-    "ros": ("rosbags",),
-    "px4": ("pyulog",),
-    "hdf5": ("h5py",),
-    "umap": ("umap-learn",),
-    "export": ("onnx", "onnxscript", "onnxruntime"),
-    "cluster": ("ray", "submitit"),
-}
+FOR_DEVELOPERS = ("test", "bench")
+"""Extras that users do not need."""
 
 
 def examine() -> dict[str, Any]:
-    """Versions, threads, scan bodies and extras, as a flat record."""
+    """Versions, threads, scan backends and optional packages, by name."""
     import torch
 
     found: dict[str, Any] = {
@@ -41,11 +33,27 @@ def examine() -> dict[str, Any]:
         "instruction sets": ", ".join(cpu.instruction_sets()) or f"none: {cpu.why_not}",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
     }
-    for name in CORE:
-        found[name] = _version(name) or "missing"
-    for extra, names in EXTRAS.items():
-        for name in names:
-            found[name] = _version(name) or f"missing; pip install 'offbeat[{extra}]'"
+    for name, extra in dependencies():
+        fix = f"; pip install 'offbeat[{extra}]'" if extra else ""
+        found[name] = _version(name) or f"missing{fix}"
+    return found
+
+
+def dependencies() -> list[tuple[str, str]]:
+    """Every package that this one needs, each with the extra that brings it, or an empty string.
+
+    They are those that the installed package declares; none where it runs without installation.
+    """
+    try:
+        declared = importlib.metadata.requires("offbeat") or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    found = []
+    for text in declared:
+        named, asked = re.match(r"[\w.-]+", text), re.search(r"extra == ['\"]([^'\"]+)", text)
+        extra = asked[1] if asked else ""
+        if named and named[0] != "offbeat" and extra not in FOR_DEVELOPERS:
+            found.append((named[0], extra))
     return found
 
 

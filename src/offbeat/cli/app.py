@@ -7,6 +7,7 @@ Torch and everything else that is slow to import is imported inside the function
 from __future__ import annotations
 
 import inspect
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -112,6 +113,9 @@ def run_commands(
         return _fail(str(error), 2)
     except RecursionError:
         return _fail("a value is nested too deeply", 2)
+    except BrokenPipeError:  # the reader of the output has gone, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (OffbeatError, OSError) as error:
         said = parsers[command].spoken(str(error)) if command else str(error)
         return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
