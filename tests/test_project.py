@@ -1,5 +1,6 @@
 """The papers of the project agree with each other and with the code."""
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -66,44 +67,8 @@ def test_contributing_stays_under_sixty_lines():
     assert len((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").splitlines()) < 60
 
 
-def file_tree(text):
-    """Files of the tree that begins with `src/offbeat/` in a page, each with what is said of it."""
-    block = re.search(r"^src/offbeat/.*\n((?:(?:[ \t].*)?\n)*)", text, re.M)
-    assert block, "docs/architecture.md has no block that begins with 'src/offbeat/'"
-    files, folders = {}, []
-    for line in filter(str.strip, block[1].splitlines()):
-        name, _, about = line.strip().partition(" ")
-        indent = len(line) - len(line.lstrip())
-        folders = [(depth, folder) for depth, folder in folders if depth < indent]
-        if name.endswith("/"):
-            folders.append((indent, name))
-        else:
-            files["".join(folder for _, folder in folders) + name] = about.strip()
-    return files
-
-
-def test_the_tree_of_the_architecture_page_is_read_by_indentation():
-    page = (
-        "```\nsrc/offbeat/\n  cli.py  the commands\n  data/  what was measured\n"
-        "    thin.py  hides rows\n    readers/\n      csv.py\n  files.py  whole files\n```\n"
-    )
-    assert file_tree(page) == {
-        "cli.py": "the commands",
-        "data/thin.py": "hides rows",
-        "data/readers/csv.py": "",
-        "files.py": "whole files",
-    }
-
-
-def test_the_architecture_page_has_a_line_for_every_module_and_for_nothing_else():
-    tree = file_tree((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
-    source = ROOT / "src" / "offbeat"
-    # The file that makes a folder a package needs no line: the folder has one.
-    modules = {
-        path.relative_to(source).as_posix()
-        for path in source.rglob("*.py")
-        if path.name != "__init__.py" or path.parent == source
-    }
-    assert modules - tree.keys() == set(), "modules without a line"
-    assert {name for name in tree if not (source / name).exists()} == set(), "lines without a file"
-    assert [name for name, about in tree.items() if not about] == [], "lines that say nothing"
+def test_every_module_begins_with_a_line_that_says_what_it_is_for():
+    for path in [*(ROOT / "src").rglob("*.py"), *(ROOT / "thesis").rglob("*.py")]:
+        said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+        assert said, path
+        assert said.splitlines()[0].endswith((".", ",", "?")), path
