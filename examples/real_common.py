@@ -197,7 +197,7 @@ def inspected(dataset: ob.Dataset) -> dict[str, Any]:
     return {
         "episodes": len(dataset),
         "rows": found.rows,
-        "known_share": found.observed,
+        "known_share": found.known,
         "channels": [
             {
                 "name": c.name,
@@ -205,7 +205,7 @@ def inspected(dataset: ob.Dataset) -> dict[str, Any]:
                 "rate_hz": c.rate_hz,
                 "missing": c.missing,
                 "longest_gap_s": c.longest_gap_s,
-                "held_share": c.held_share,
+                "held_share": c.repeated_fraction,
                 "constant": c.constant,
             }
             for c in found.channels

@@ -17,7 +17,7 @@ def g1(small: bool) -> Log:
     if not path.exists():
         raise SystemExit(f"{path} is not here; set OFFBEAT_DATA to the folder that has it")
     episodes = list(range(12)) if small else None
-    log = ob.read(path, episodes=episodes, columns=["observation.state"], held="mask")
+    log = ob.read(path, episodes=episodes, columns=["observation.state"], repeated="mask")
     hands = tuple(name for name in log.names if "Hand" in name)
     arms = tuple(name for name in log.names if "Hand" not in name)
     train, validation, test = ob.split(log, seed=0)

@@ -1,4 +1,4 @@
-"""What policies do about faults of clocks and sensors: closed forms, and properties."""
+"""Cleaning of recordings while they are read: closed forms, and properties."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from offbeat.data.cleaning import channels as mend
-from offbeat.data.cleaning.options import sentences
+from offbeat.data.cleaning import channels as cleaned
+from offbeat.data.cleaning.log import sentences
 from offbeat.data.recording import ReaderOptions, Recording, Signal, assemble
 from offbeat.errors import FileFormatError, InputError
 
@@ -26,12 +26,12 @@ def signal(stamps_ms, *columns, name="", channels=None, **fields):
     return Signal(name, stamps, values, names, **fields)
 
 
-def built(*signals, policies=None, **options):
-    return assemble([Recording(signals)], policies or ReaderOptions(**options))
+def built(*signals, **options):
+    return assemble([Recording(signals)], ReaderOptions(**options))
 
 
 def report(dataset):
-    return dataset.meta["report"]
+    return dataset.meta["cleaning"]
 
 
 def same(got, expected):
@@ -60,7 +60,7 @@ class TestRoles:
         repeated = np.repeat(np.arange(20.0), 5)
         stamps = 10 * np.arange(100)
         logged = signal(stamps, repeated, repeated, roles=("state", "action"))
-        dataset = built(logged, held="mask")
+        dataset = built(logged, repeated="mask")
         assert dataset[0].observed.sum(axis=0).tolist() == [20, 100]
         flips = np.resize([[1.0, 0, 0, 0], [-1.0, 0, 0, 0]], (8, 4))
         q = signal(10 * np.arange(8), *flips.T, channels=("qw", "qx", "qy", "qz"))
@@ -72,8 +72,8 @@ class TestOrder:
         dataset = built(signal([0, 20, 10, 30], [0.0, 2.0, 1.0, 3.0]))
         assert dataset[0].times.tolist() == [0.0, 0.01, 0.02, 0.03]
         assert dataset[0].values[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
-        assert report(dataset)["order"] == {"policy": "sort", "late": 1, "signals": {"x": 1}}
-        assert "1 row came late and was sorted in" in sentences(report(dataset))
+        assert report(dataset)["order"] == {"option": "sort", "late": 1, "signals": {"x": 1}}
+        assert "1 row came late and was sorted" in sentences(report(dataset))
 
     def test_late_rows_can_be_dropped(self):
         dataset = built(signal([0, 20, 10, 30], [0.0, 2.0, 1.0, 3.0]), order="drop")
@@ -130,7 +130,7 @@ class TestClockJumps:
         first, second = dataset = built(signal(self.BACK, range(200)))
         assert (first.rows, second.rows) == (100, 100)
         assert second.values[0, 0] == 100
-        assert report(dataset)["clock_jumps"] == {"policy": "split", "found": 1}
+        assert report(dataset)["clock_jumps"] == {"option": "split", "found": 1}
         assert report(dataset)["order"]["late"] == 0
         assert report(dataset)["episodes"] == [{"episode": 1, "clock_set_before": 1}]
 
@@ -292,48 +292,48 @@ class TestChannels:
             built(signal([0], [1.0]), without=("x",))
 
 
-class TestHeldValues:
+class TestRepeatedValues:
     STAMPS = range(0, 1000, 5)
 
-    def held(self, **options):
+    def repeated(self, **options):
         fresh = np.random.default_rng(0).normal(size=50)
         moving = np.random.default_rng(1).normal(size=200)
         columns = (np.repeat(fresh, 4), moving, np.ones(200))
         return fresh, built(signal(self.STAMPS, *columns), **options)
 
     def test_a_slower_sensor_on_a_faster_grid_is_found(self):
-        _, dataset = self.held()
-        found = report(dataset)["held"]
-        assert found["channels"] == {"x": {"share": 150 / 199, "rows_per_value": 4}}
+        _, dataset = self.repeated()
+        found = report(dataset)["repeated"]
+        assert found["channels"] == {"x": {"fraction": 150 / 199, "rows_per_value": 4}}
         assert found["masked"] == 0
         assert dataset[0].known.all()
 
     def test_repeats_are_masked_on_request(self):
-        fresh, dataset = self.held(held="mask")
+        fresh, dataset = self.repeated(repeated="mask")
         column = dataset[0].values[:, 0]
         assert np.flatnonzero(~np.isnan(column)).tolist() == list(range(0, 200, 4))
         assert column[::4].tolist() == fresh.tolist()
         assert dataset[0].known[:, 1:].all()
-        assert report(dataset)["held"]["masked"] == 150
+        assert report(dataset)["repeated"]["masked"] == 150
 
     def test_a_sensor_at_rest_is_measured_at_its_own_rate(self):
         values = np.repeat(np.arange(30.0), 4)
         values[40:80] = 10.0  # rests for ten of its own steps
-        dataset = built(signal(range(0, 600, 5), values), held="mask")
+        dataset = built(signal(range(0, 600, 5), values), repeated="mask")
         assert np.flatnonzero(dataset[0].known[:, 0]).tolist() == list(range(0, 120, 4))
 
-    def test_a_sensor_that_now_and_then_rests_is_not_held(self):
+    def test_a_sensor_that_now_and_then_rests_repeats_nothing(self):
         values = np.random.default_rng(0).normal(size=200)
         values[50:190] = 1.0
-        assert report(built(signal(self.STAMPS, values)))["held"]["channels"] == {}
+        assert report(built(signal(self.STAMPS, values)))["repeated"]["channels"] == {}
 
-    def test_held_is_found_over_all_episodes_together(self):
+    def test_repeats_are_found_over_all_episodes_together(self):
         parts = [
             Recording((signal(range(0, 60, 5), np.repeat(np.arange(3.0) + 10 * i, 4)),))
             for i in range(6)
         ]
-        dataset = assemble(parts, ReaderOptions(held="mask"))
-        assert report(dataset)["held"]["channels"]["x"]["rows_per_value"] == 4
+        dataset = assemble(parts, ReaderOptions(repeated="mask"))
+        assert report(dataset)["repeated"]["channels"]["x"]["rows_per_value"] == 4
         assert all(t.known.sum() == 3 for t in dataset)
 
     @given(
@@ -342,7 +342,9 @@ class TestHeldValues:
         ),
         st.integers(1, 3),
     )
-    def test_held_is_what_its_definition_says_however_early_it_is_decided(self, episodes, repeat):
+    def test_repeats_are_what_the_definition_says_however_early_it_is_decided(
+        self, episodes, repeat
+    ):
         columns = [np.repeat(np.array(column, dtype=float), repeat) for column in episodes]
         known = [[x for x in column.tolist() if not np.isnan(x)] for column in columns]
         pairs = [a == b for column in known for a, b in itertools.pairwise(column)]
@@ -354,8 +356,8 @@ class TestHeldValues:
         usual = int(np.median(runs)) if runs else 0
         expected = None
         if pairs and sum(pairs) >= 0.5 * len(pairs) and len(runs) >= 10 and usual >= 2:
-            expected = mend.Held(sum(pairs) / len(pairs), usual)
-        assert mend.find_held(columns) == expected
+            expected = cleaned.Repeats(sum(pairs) / len(pairs), usual)
+        assert cleaned.find_repeats(columns) == expected
 
 
 class TestAngles:
@@ -437,12 +439,12 @@ class TestQuaternions:
         assert dataset[0].values.tobytes("C") == rotation.tobytes()
 
 
-class TestInfiniteCells:
+class TestInfiniteValues:
     def test_count_as_missing_or_are_refused(self):
         logged = signal([0, 10], [np.inf, 1.0])
         dataset = built(logged)
         assert same(dataset[0].values[:, 0], [NAN, 1])
-        assert report(dataset)["infinite"]["cells"] == 1
+        assert report(dataset)["infinite"]["values"] == 1
         assert np.isinf(logged.values[0, 0])
         with pytest.raises(FileFormatError, match="infinite at row 0, channel 'x'"):
             built(logged, infinite="refuse")
@@ -502,7 +504,7 @@ def test_the_report_is_json_with_every_policy_and_notes_are_said_once():
     ("options", "message"),
     [
         ({"order": "sorted"}, "unknown order 'sorted', expected one of: drop, refuse, sort"),
-        ({"held": "hide"}, "unknown held 'hide'"),
+        ({"repeated": "hide"}, "unknown repeated 'hide'"),
         ({"max_gap_s": 0}, "max_gap_s must be seconds above 0, 'auto', or None"),
         ({"max_gap_s": "never"}, "got 'never'"),
         ({"resample_hz": -1}, "resample_hz must be above 0"),
@@ -514,7 +516,7 @@ def test_the_report_is_json_with_every_policy_and_notes_are_said_once():
         ({"min_rows": 1.5}, "min_rows must be an integer"),
     ],
 )
-def test_policies_that_are_none_are_refused(options, message):
+def test_options_that_are_none_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         ReaderOptions(**options)
 

@@ -185,20 +185,20 @@ def test_a_config_counts_where_nothing_is_typed_before_or_after_it(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(
         "paths: [c]\nseed: 5\ntwo_sided: true\nhorizons: 0.5\nmodel: {name: gru, hidden_size: 3}\n"
-        "reader: {held: mask, max_gap_s: null}\ntraining: null\n"
+        "reader: {repeated: mask, max_gap_s: null}\ntraining: null\n"
     )
     config = f"--config={path}"
     alone = parsed(config)
     assert (alone["paths"], alone["seed"], alone["two_sided"]) == (["c"], 5, True)
     assert (alone["horizons"], alone["training"]) == (0.5, None)
-    assert alone["reader"] == {"held": "mask", "max_gap_s": None}
+    assert alone["reader"] == {"repeated": "mask", "max_gap_s": None}
     typed = [
         "a",
         "b",
         "--seed=0",
         "--model.hidden_size=4",
         "--two_sided=false",
-        "--reader.held=keep",
+        "--reader.repeated=keep",
     ]
     for arguments in (
         [config, *typed],
@@ -208,7 +208,7 @@ def test_a_config_counts_where_nothing_is_typed_before_or_after_it(tmp_path):
         got = parsed(*arguments)
         assert (got["paths"], got["seed"], got["two_sided"]) == (["a", "b"], 0, False)
         assert got["model"] == ob.ModelConfig(name="gru", hidden_size=4)
-        assert got["reader"] == {"held": "keep", "max_gap_s": None}
+        assert got["reader"] == {"repeated": "keep", "max_gap_s": None}
     second = tmp_path / "second.yaml"
     second.write_text("seed: 6\n")
     both = parsed(config, "--config", str(second))
@@ -340,7 +340,7 @@ def test_options_of_the_run_hold_beside_those_that_are_given(run, stamped, tmp_p
     shutil.copytree(run, copy)
     (copy / "reader.json").write_text('{"time_column": "when", "time_unit": "s"}')
     predict = ["predict", str(copy), str(stamped), str(out), "--times=0.01"]
-    for options in ([], ["--reader.held=mask"]):
+    for options in ([], ["--reader.repeated=mask"]):
         assert main([*predict, *options]) == 0
     assert main([*predict, "--time_unit=ms"]) == 0
     with out.open(newline="") as file:

@@ -1,4 +1,4 @@
-"""`offbeat inspect`: rates, gaps, held values and faults of a log whose faults are known."""
+"""`offbeat inspect`: rates, gaps, repeated values and anomalies that are known in advance."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import pytest
 from PIL import Image
 from real_logs import shared
 
+import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.data.advice import advise
-from offbeat.data.inspection import inspect
+from offbeat.data.inspection import inspect, without_repeats
 from offbeat.data.readers import read
+from offbeat.data.recording import ReaderOptions, Recording, Signal, assemble
 
 ROWS = 400
 
@@ -53,7 +55,7 @@ def test_every_fault_that_was_put_in_is_found_and_said(faulty):
     assert channels["arm"].longest_gap_s == pytest.approx(0.02)
     assert channels["arm"].unit == "m"
     assert (channels["temp"].rows_per_value, channels["arm"].rows_per_value) == (4, 0)
-    assert (channels["broken"].cells, channels["broken"].rate_hz) == (0, None)
+    assert (channels["broken"].known, channels["broken"].rate_hz) == (0, None)
     assert channels["qx"].constant
     assert channels["yaw"].high > 9  # 10 rad per episode, from within half a turn on
     first, second = found.episodes
@@ -61,16 +63,35 @@ def test_every_fault_that_was_put_in_is_found_and_said(faulty):
     assert second.outage_before_s == pytest.approx(12.01)
     said = " ".join(found.found)
     for words in (
-        "taken to be in us", "1 row came late", "1 row had the stamp", "1 outage of 12 s began",
-        "held values", "jumps by a turn were taken out of yaw", "200 rows changed sign",
+        "taken to be in us", "1 row came late", "1 row had the time stamp",
+        "1 outage of 12 s began",
+        "repeated values", "jumps by a turn were removed from yaw", "200 rows changed sign",
     ):  # fmt: skip
         assert words in said
 
 
-def test_the_advice_masks_what_is_held_and_keeps_a_quaternion_whole(faulty):
-    command = advise(inspect(read(faulty)), "faulty.csv").command
+def test_the_advice_masks_repeats_and_keeps_a_quaternion_whole(faulty):
+    command = advise(read(faulty), "faulty.csv").command
     assert "--reader.without=[broken]" in command
-    assert "--reader.held=mask" in command
+    assert "--reader.repeated=mask" in command
+
+
+def test_the_advice_holds_for_the_data_as_they_will_be_read():
+    # A sensor of 20 Hz whose values a recording of 100 Hz repeats, beside one of 100 Hz.
+    rows = np.arange(2000)
+    values = np.column_stack([np.sin(0.1 * rows), (rows // 5) % 11])
+    (one,) = data = ob.Dataset((ob.Trajectory(rows / 100, values, names=("fast", "slow")),))
+    assert inspect(data).channels[1].rate_hz == pytest.approx(100)
+    masked = inspect(without_repeats(data)).channels
+    assert [c.rate_hz for c in masked] == pytest.approx([100, 20])
+    advice = advise(data, "log.csv")
+    assert "about 20 values of the slowest channel, at 20 Hz" in " ".join(advice.reasons)
+    assert "--split.mask=dropout" in advice.command
+    as_read = assemble(
+        [Recording((Signal("", 10_000_000 * rows, values.copy(), one.names),))],
+        ReaderOptions(repeated="mask"),
+    )
+    assert np.array_equal(as_read[0].observed, without_repeats(data)[0].observed)
 
 
 def test_the_command_of_the_advice_trains(faulty, tmp_path, capsys):
@@ -79,7 +100,7 @@ def test_the_command_of_the_advice_trains(faulty, tmp_path, capsys):
     small = ["--model.name=gru", "--model.hidden_size=4", "--training.epochs=1"]
     assert main([*told["advice"]["command"][1:], *small]) == 0
     kept = json.loads((tmp_path / "run" / "reader.json").read_text())
-    assert kept == {"without": ["broken"], "held": "mask"}
+    assert kept == {"without": ["broken"], "repeated": "mask"}
     predictions = tmp_path / "predictions.csv"
     assert main(["predict", str(tmp_path / "run"), str(faulty), str(predictions)]) == 0
     assert "broken" not in predictions.read_text().splitlines()[0]

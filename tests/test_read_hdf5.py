@@ -62,7 +62,7 @@ class TestRobomimic:
         assert dataset[0].times.tolist() == [0.0, 0.05, 0.1, 0.15, 0.2]
         assert (
             "row number / 20 Hz, the environment's control_freq"
-            in dataset.meta["report"]["notes"][0]
+            in dataset.meta["cleaning"]["notes"][0]
         )
         assert read(robomimic, rate_hz=10)[0].times[1] == 0.1
 
@@ -93,7 +93,7 @@ class TestRobomimic:
         path = logs.write_robomimic(tmp_path / "a.hdf5", [demo(3)], control_freq=None)
         dataset = read(path)
         assert dataset[0].times.tolist() == [0.0, 1.0, 2.0]
-        assert "1 s apart" in dataset.meta["report"]["notes"][0]
+        assert "1 s apart" in dataset.meta["cleaning"]["notes"][0]
 
     def test_takes_stamps_that_are_recorded(self, tmp_path):
         stamps = np.array([5.0, 5.125, 5.5])
@@ -116,7 +116,7 @@ class TestMinari:
         assert np.array_equal(dataset[0].values[:, :3], observations)
         assert dataset[0].times.tolist() == [0.0, 0.02, 0.04, 0.06]
         assert np.array_equal(dataset[0].actions, np.vstack([actions, actions[-1:]]))
-        notes = dataset.meta["report"]["notes"]
+        notes = dataset.meta["cleaning"]["notes"]
         assert "the last observation has no action; that of the row before is used" in notes
 
     @pytest.mark.parametrize("inside", ["", "data", "data/main_data.hdf5"])

@@ -61,7 +61,7 @@ class TestADataSet:
     def test_says_aloud_that_its_stamps_are_made_up(self, write):
         dataset = read(write())
         assert dataset[0].times.tolist() == [0.0, 0.05, 0.1, 0.15]
-        notes = dataset.meta["report"]["notes"]
+        notes = dataset.meta["cleaning"]["notes"]
         assert "stamps are row number / 20 fps, no times were recorded" in notes
         assert "left out: observation.images.front (video)" in notes
 
@@ -71,7 +71,7 @@ class TestADataSet:
         )
         dataset = read(write(episodes, features=features))
         assert dataset[0].times.tolist() == [0.0, 8e-9, 18e-9, 30e-9]
-        assert dataset.meta["report"]["notes"][0] == "stamps are the column 'observation.time_ns'"
+        assert dataset.meta["cleaning"]["notes"][0] == "stamps are the column 'observation.time_ns'"
         assert dataset.names[:3] == ("hip", "knee", "ankle")
 
     def test_takes_stamps_that_jitter_in_the_usual_column(self, write):
@@ -84,7 +84,7 @@ class TestADataSet:
 
     def test_takes_no_column_that_is_row_number_by_fps_for_a_clock(self, write):
         episodes, features = with_column("observation.time_ms", "int64", lambda i, n: 50 * n)
-        notes = read(write(episodes, features=features)).meta["report"]["notes"]
+        notes = read(write(episodes, features=features)).meta["cleaning"]["notes"]
         assert "stamps are row number / 20 fps, no times were recorded" in notes
 
     def test_gives_the_columns_and_episodes_that_are_asked_for(self, write):

@@ -14,10 +14,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from offbeat.data import memory, readers
-from offbeat.data.readers import FOLDER, Reader, read, register
+from offbeat.data.readers import FOLDER, READERS, read, register_reader
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError
+from offbeat.registry import Registry
 
 NAN = float("nan")
 
@@ -39,7 +40,7 @@ def refused(path, message, error=FileFormatError, **options):
 
 
 def notes_of(dataset):
-    return dataset.meta["report"]["notes"]
+    return dataset.meta["cleaning"]["notes"]
 
 
 def same(got, expected):
@@ -519,14 +520,15 @@ class TestReadersOfOthers:
             """)
             )
             monkeypatch.syspath_prepend(tmp_path / "site")
-            monkeypatch.setattr(readers, "READERS", dict(readers.READERS))
-            readers.load_entry_points.cache_clear()
+            fresh = Registry("format", group="offbeat.readers")
+            for name, reader in READERS.items():
+                fresh.register(name, reader)
+            monkeypatch.setattr(readers, "READERS", fresh)
 
         yield install
-        readers.load_entry_points.cache_clear()
         sys.modules.pop("other_readers", None)
 
-    def test_are_found_by_their_entry_points_and_get_the_policies(self, package, text_file):
+    def test_are_found_by_their_entry_points_and_are_cleaned(self, package, text_file):
         package(steps="other_readers:READER", made="other_readers:make")
         dataset = read(text_file("any", "walk.steps"), step_ms=20, resample_hz=100)
         assert dataset[0].times.tolist() == [0.0, 0.01, 0.02, 0.03, 0.04]
@@ -534,23 +536,33 @@ class TestReadersOfOthers:
 
     def test_that_can_not_be_loaded_cost_a_warning_and_nothing_else(self, package, text_file):
         package(broken="other_readers:broken", none="no_such_module:READER")
-        with pytest.warns(UserWarning, match="'(broken|none)'.*can't be used: .*Error") as warned:
+        with pytest.warns(
+            UserWarning, match="'(broken|none)'.*cannot be loaded: .*Error"
+        ) as warned:
             assert read(text_file("time,x\n0,1\n")).names == ("x",)
         assert len(warned) == 2
 
     def test_of_folders_must_be_able_to_recognise_them(self, monkeypatch):
-        monkeypatch.setattr(readers, "READERS", dict(readers.READERS))
         with pytest.raises(InputError, match="needs recognises"):
-            register(Reader("album", (FOLDER,), lambda path: []))
+            register_reader("album", lambda path: [], suffixes=(FOLDER,))
 
-    def test_that_finish_their_data_set_take_no_policies(self, monkeypatch, text_file):
-        monkeypatch.setattr(readers, "READERS", dict(readers.READERS))
+    def test_that_finish_their_data_set_take_no_options_of_cleaning(self, text_file):
         finished = read(text_file("time,x\n0,1\n"))
-        register(Reader("done", (".done",), lambda path: finished))
-        path = text_file("any", "walk.done")
-        assert read(path) is finished
-        refused(path, "finished data set, to which policies no longer apply, got held", InputError,
-                held="mask")  # fmt: skip
+        register_reader("done", lambda path: finished, suffixes=(".done",))
+        try:
+            path = text_file("any", "walk.done")
+            assert read(path) is finished
+            refused(path, "not cleaned again, got the options repeated", InputError,
+                    repeated="mask")  # fmt: skip
+        finally:
+            READERS.unregister("done")
+
+    def test_take_the_option_held_of_runs_of_0_1_0_for_repeated(self, text_file):
+        rows = "\n".join(f"{i},{i // 4 % 7}" for i in range(100))
+        path = text_file(f"time,x\n{rows}\n")
+        assert read(path, held="mask").fingerprint() == read(path, repeated="mask").fingerprint()
+        assert read(path, held="mask")[0].observed.sum() == 25
+        assert read(path, held="mask", repeated="keep")[0].observed.all()
 
     def test_a_folder_of_nothing_known_is_an_error_of_one_line(self, tmp_path):
         refused(tmp_path, "is an empty folder")

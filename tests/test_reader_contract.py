@@ -13,7 +13,7 @@ import pytest
 from log_writers import OPTIONS, WRITERS
 from real_logs import evo, shared
 
-from offbeat.data.readers import POLICIES, READERS, options_of, read
+from offbeat.data.readers import OPTIONS as CLEANING, READERS, read
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError
 
@@ -23,7 +23,7 @@ STAMPS = START + 1000 * np.cumsum(RNG.integers(1000, 30_000, 150))
 VALUES = RNG.normal(size=(150, 2))
 TEXT = ("csv", "csv long", "tum", "euroc", "euroc folder")
 MESSAGES = ("ros", "ulog")  # formats that can be read up to where they are cut
-SKIPPED = {"offbeat": "a data set of ours is finished: it has no clock and no policies"}
+SKIPPED = {"offbeat": "a data set of ours is finished: it has no clock and is not cleaned"}
 
 
 @pytest.fixture(params=sorted(WRITERS))
@@ -122,7 +122,7 @@ def test_the_clock_at_the_start_is_kept_to_the_tick(variant, log):
         assert meta["clock_start"] == pytest.approx([STAMPS[0] / 1e9], rel=1e-15)
 
 
-def test_nan_is_a_cell_that_is_not_known(variant, tmp_path):
+def test_nan_is_a_value_that_is_not_known(variant, tmp_path):
     values = VALUES.copy()
     values[5, 1] = values[9, 0] = np.nan
     dataset = read_back(variant, WRITERS[variant](tmp_path / "walk", STAMPS, values))
@@ -130,7 +130,7 @@ def test_nan_is_a_cell_that_is_not_known(variant, tmp_path):
     assert np.array_equal(dataset[0].observed, ~np.isnan(dataset[0].values))
 
 
-def test_late_and_repeated_stamps_are_mended_and_counted(variant, tmp_path):
+def test_late_and_repeated_stamps_are_cleaned_and_counted(variant, tmp_path):
     if variant in SKIPPED:
         pytest.skip(SKIPPED[variant])
     stamps = STAMPS.copy()
@@ -142,8 +142,8 @@ def test_late_and_repeated_stamps_are_mended_and_counted(variant, tmp_path):
     assert dataset[0].times.tolist() == ((stamps[kept] - stamps[0]) / 1e9).tolist()
     assert walk_of(dataset).tobytes("C") == VALUES[kept].tobytes("C")
     channels = 2 if variant in ("csv long", "parquet long") else 1
-    assert dataset.meta["report"]["order"]["late"] == channels
-    assert dataset.meta["report"]["duplicates"]["rows"] == channels
+    assert dataset.meta["cleaning"]["order"]["late"] == channels
+    assert dataset.meta["cleaning"]["duplicates"]["rows"] == channels
 
 
 def test_an_outage_begins_a_new_episode(variant, tmp_path):
@@ -155,8 +155,8 @@ def test_an_outage_begins_a_new_episode(variant, tmp_path):
     assert (first.rows, second.rows) == (60, 90)
     assert second.times[0] == 0
     outage = (stamps[60] - stamps[59]) / 1e9
-    assert dataset.meta["report"]["outages"]["longest_s"] == outage
-    assert dataset.meta["report"]["episodes"] == [{"episode": 1, "outage_before_s": outage}]
+    assert dataset.meta["cleaning"]["outages"]["longest_s"] == outage
+    assert dataset.meta["cleaning"]["episodes"] == [{"episode": 1, "outage_before_s": outage}]
     assert read_back(variant, path, max_gap_s=None)[0].rows == 150
 
 
@@ -209,7 +209,7 @@ def test_a_truncated_file_is_an_error_of_one_line_or_reads_up_to_the_cut(variant
         return
     with contextlib.suppress(FileFormatError):
         rest = read_back(variant, log)
-        assert rest.meta["report"]["notes"] != whole.meta["report"]["notes"]  # it is said aloud
+        assert rest.meta["cleaning"]["notes"] != whole.meta["cleaning"]["notes"]  # it is said aloud
         assert 0 < rest[0].rows < whole[0].rows
 
 
@@ -228,9 +228,9 @@ def test_an_unknown_option_is_answered_with_those_there_are(variant, log):
     with pytest.raises(InputError) as error:
         read_back(variant, log, no_such_option=1)
     said = one_line(error)
-    options = options_of(reader)
+    options = reader.options
     assert all(option in said for option in options) if options else "no options" in said
-    assert set(POLICIES) <= set(options) or not reader.policies
+    assert set(CLEANING) <= set(options) or not reader.cleaning
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from offbeat.data.cleaning.clocks import TIME_NAMES
-from offbeat.data.readers import READERS, Reader, read, register
+from offbeat.data.readers import READERS, read, register_reader
 from offbeat.data.readers.columns import LABEL_NAMES
 from offbeat.data.readers.table import MISSING
 from offbeat.data.store import save
@@ -64,20 +64,25 @@ class TestTheRegistry:
         save(Dataset([Trajectory([0.0], [[1.0]])]), tmp_path / "a.parquet")
         refused(tmp_path / "a.parquet", "takes no options, got 'seed'", InputError, seed=1)
 
-    def test_decides_by_the_content_between_readers_of_one_suffix(self, csv_file, monkeypatch):
-        monkeypatch.setattr("offbeat.data.readers.READERS", dict(READERS))
+    def test_decides_by_the_content_between_readers_of_one_suffix(self, csv_file):
         other = Dataset([Trajectory([0.0], [[42.0]])])
-        register(
-            Reader("pipe", (".csv",), lambda path: other, lambda path: "|" in path.read_text())
+        register_reader(
+            "pipe",
+            lambda path: other,
+            suffixes=(".csv",),
+            recognises=lambda path: "|" in path.read_text(),
         )
-        assert read(csv_file("time|x\n0|1\n"))[0].values == [[42.0]]
-        assert read(csv_file("time,x\n0,1\n"))[0].values == [[1.0]]
+        try:
+            assert read(csv_file("time|x\n0|1\n"))[0].values == [[42.0]]
+            assert read(csv_file("time,x\n0,1\n"))[0].values == [[1.0]]
+        finally:
+            READERS.unregister("pipe")
 
     def test_refuses_a_name_that_is_taken_and_a_suffix_without_dot(self):
         with pytest.raises(InputError, match="'csv' already"):
-            register(Reader("csv", (".txt",), lambda path: None))
+            register_reader("csv", lambda path: None, suffixes=(".txt",))
         with pytest.raises(InputError, match="lower case with a dot"):
-            register(Reader("text", ("txt",), lambda path: None))
+            register_reader("text", lambda path: None, suffixes=("txt",))
 
     @pytest.mark.parametrize("name", sorted(READERS))
     def test_has_readers_whose_options_are_keywords_with_defaults(self, name):

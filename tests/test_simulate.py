@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from offbeat.data import simulate as module
-from offbeat.data.robots import ROBOTS, channels_of, load_model
+from offbeat.data.robots import ROBOTS, channels_of, load_model, register_robot
 from offbeat.data.simulate import available_cores, simulate
-from offbeat.errors import DivergenceError, InputError, MissingExtraError
+from offbeat.errors import DivergenceError, FileFormatError, InputError, MissingExtraError
 
 mujoco = pytest.importorskip("mujoco")
 pytestmark = pytest.mark.skipif(
@@ -67,6 +67,81 @@ def test_walker_starts_inside_its_joint_ranges():
     assert (angles[:, limited] <= model.jnt_range[limited, 1]).all()
 
 
+CART = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="cart" type="slide" axis="1 0 0"/><geom size="0.1" mass="2"/></body>
+  </worldbody>
+  <actuator><motor name="push" joint="cart"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def cart(tmp_path):
+    """A mass of 2 kg on a rail, pushed by a spring law of control, from outside the package."""
+    path = tmp_path / "cart.xml"
+    path.write_text(CART)
+    register_robot(
+        "cart",
+        path,
+        draw=lambda random, model, n: random.uniform(-1, 1, size=(n, 2)),
+        control=lambda time, state: np.array([-3 * state[0] + time]),
+    )
+    yield path
+    ROBOTS.unregister("cart")
+
+
+def test_a_robot_of_the_users_own_follows_its_control(cart):
+    dataset = quiet("cart", 3, 50, seed=7)
+    assert dataset.names == ("cart_qpos", "cart_qvel", "push_ctrl")
+    assert dataset.roles == ("state", "state", "action")
+    starts = np.random.RandomState(7).uniform(-1, 1, size=(3, 2))
+    for one, (x, v) in zip(dataset, starts, strict=True):
+        for row in range(50):  # semi-implicit Euler steps of x'' = u / 2
+            u = -3 * x + 0.01 * row
+            assert np.allclose(one.values[row], [x, v, u], rtol=0, atol=1e-12)
+            v += 0.01 * u / 2
+            x += 0.01 * v
+
+
+def test_recorded_controls_give_the_same_trajectories_as_the_function(cart):
+    driven = quiet("cart", 3, 50, seed=7)
+    replayed = quiet("cart", 3, 50, seed=7, controls=[t.actions for t in driven], threads=2)
+    assert values_of(replayed).tobytes() == values_of(driven).tobytes()
+    assert (driven.meta["control"], replayed.meta["control"]) == ("function", "recorded")
+    still = quiet(cart, rows=5, controls=np.zeros((5, 1)), initial_states=[[1.0, 0.5]])
+    assert np.allclose(still[0].values[:, 0], 1 + 0.005 * np.arange(5))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"controls": np.zeros((3, 1))}, r"shape \(5, 20, 1\) .*got \(3, 1\)"),
+        ({"controls": np.full((20, 1), np.nan)}, "controls must be finite"),
+        ({"controls": lambda time, state: [0.0, 0.0]}, r"1 finite numbers, got \[0.0, 0.0\]"),
+        ({"controls": lambda time, state: [np.nan]}, r"got \[nan\] for trajectory 0, row 0"),
+    ],
+)
+def test_controls_that_do_not_fit_the_robot_are_refused(cart, options, message):
+    with pytest.raises(InputError, match=message):
+        quiet("cart", **options)
+
+
+def test_an_unstable_controlled_robot_is_an_error(cart):
+    with pytest.raises(DivergenceError, match="'cart' became unstable in trajectory 0"):
+        quiet("cart", rows=200, controls=lambda time, state: 1e12 * state[:1])
+
+
+def test_a_file_that_is_no_mjcf_is_refused(tmp_path):
+    (tmp_path / "a.xml").write_text("<mujoco><joint/></mujoco>")
+    with pytest.raises(FileFormatError, match="cannot be compiled as MJCF"):
+        quiet(tmp_path / "a.xml")
+    with pytest.raises(FileFormatError, match=r"none.xml can't be read"):
+        quiet(str(tmp_path / "none.xml"))
+
+
 @pytest.mark.parametrize("robot", sorted(ROBOTS))
 class TestEveryRobot:
     def test_has_a_channel_with_a_unit_per_position_and_velocity(self, robot):
@@ -102,7 +177,7 @@ class TestEveryRobot:
         np.save(tmp_path / "starts.npy", values_of(dataset)[:, 0])
         # A process of its own: importing dm_control fixes the rendering backend for good.
         done = subprocess.run(
-            [sys.executable, "-c", STEP_WITH_DM_CONTROL, ROBOTS[robot].xml],
+            [sys.executable, "-c", STEP_WITH_DM_CONTROL, f"{robot}.xml"],
             cwd=tmp_path,
             env=os.environ | {"MUJOCO_GL": "disable"},
             capture_output=True,

@@ -22,14 +22,18 @@ if TYPE_CHECKING:
     from offbeat.answers.two_sided import TwoSided
     from offbeat.comparison import Comparison, compare, read_runs
     from offbeat.data.batch import Batch, delta, last_values
+    from offbeat.data.frames import from_pandas, to_pandas
+    from offbeat.data.inspection import inspect
     from offbeat.data.masking import mask_out
-    from offbeat.data.readers import read
+    from offbeat.data.readers import read, register_reader
+    from offbeat.data.robots import register_robot
     from offbeat.data.scaler import Scaler
     from offbeat.data.simulate import simulate
     from offbeat.data.splits import apply_split, split, split_in_time
-    from offbeat.data.store import load, save
+    from offbeat.data.store import load
     from offbeat.data.trajectory import Dataset, Trajectory
     from offbeat.data.windows import windows
+    from offbeat.data.writers import register_writer, save
     from offbeat.evaluation import Evaluation, evaluate
     from offbeat.export.exporter import export_onnx
     from offbeat.export.runner import OnnxStream
@@ -71,7 +75,9 @@ _HOMES = {
     "fit": "training",
     "fit_two_sided": "answers.impute",
     "forecast": "answers.forecast",
+    "from_pandas": "data.frames",
     "impute": "answers.impute",
+    "inspect": "data.inspection",
     "last_values": "data.batch",
     "load": "data.store",
     "load_model": "models.checkpoint",
@@ -81,8 +87,11 @@ _HOMES = {
     "predict": "answers.predict",
     "read": "data.readers",
     "read_runs": "comparison",
+    "register_reader": "data.readers",
+    "register_robot": "data.robots",
+    "register_writer": "data.writers",
     "row_0_constant": "metrics",
-    "save": "data.store",
+    "save": "data.writers",
     "save_model": "models.checkpoint",
     "save_two_sided": "answers.impute",
     "score_forecast": "answers.scoring",
@@ -92,6 +101,7 @@ _HOMES = {
     "split_in_time": "data.splits",
     "sweep": "sweeps.sweep",
     "thesis_config": "models.zoo",
+    "to_pandas": "data.frames",
     "train_config": "models.zoo",
     "windows": "data.windows",
 }
@@ -130,7 +140,9 @@ __all__ = [
     "fit",
     "fit_two_sided",
     "forecast",
+    "from_pandas",
     "impute",
+    "inspect",
     "last_values",
     "load",
     "load_model",
@@ -140,6 +152,9 @@ __all__ = [
     "predict",
     "read",
     "read_runs",
+    "register_reader",
+    "register_robot",
+    "register_writer",
     "row_0_constant",
     "save",
     "save_model",
@@ -151,6 +166,7 @@ __all__ = [
     "split_in_time",
     "sweep",
     "thesis_config",
+    "to_pandas",
     "train_config",
     "windows",
 ]

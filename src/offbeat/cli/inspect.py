@@ -28,7 +28,7 @@ def inspect_command(
     """
     from offbeat.data.advice import advise
     from offbeat.data.inspection import inspect
-    from offbeat.data.readers import READERS, options_of, read
+    from offbeat.data.readers import READERS, read
     from offbeat.files import writable
 
     if out is not None:
@@ -41,8 +41,8 @@ def inspect_command(
     finally:
         logging.getLogger("offbeat").removeFilter(_silence)
     inspection = inspect(dataset)
-    known = options_of(READERS[inspection.format]) if inspection.format in READERS else ()
-    advice = advise(inspection, str(data), str(run), reader=reader, known=known)
+    known = READERS[inspection.format].options if inspection.format in READERS else ()
+    advice = advise(dataset, str(data), str(run), reader=reader, known=known)
     result = inspection.to_dict()
     result["advice"] = {"command": list(advice.command), "reasons": list(advice.reasons)}
     if out is not None:

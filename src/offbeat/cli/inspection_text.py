@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from offbeat.data.inspection import EpisodeFacts, Inspection
+from offbeat.data.inspection import EpisodeInspection, Inspection
 
 _MOST_EPISODES = 12
 
@@ -18,7 +18,7 @@ def heading(inspection: Inspection) -> str:
         f"{inspection.source or 'data set'} ({inspection.format}, times in "
         f"{inspection.time_unit}): {episodes} episode{'' if episodes == 1 else 's'}, "
         f"{inspection.rows} rows in {lasts:.6g} s{rate}, {len(inspection.channels)} channels, "
-        f"{100 * inspection.observed:.1f} % of the cells known"
+        f"{100 * inspection.known:.1f} % of the values known"
     )
 
 
@@ -26,8 +26,10 @@ def channel_table(inspection: Inspection) -> str:
     """A line per channel."""
     rows = []
     for c in inspection.channels:
-        held = (
-            "" if not c.rows_per_value else f"{c.rows_per_value} rows ({100 * c.held_share:.0f} %)"
+        repeated = (
+            ""
+            if not c.rows_per_value
+            else f"{c.rows_per_value} rows ({100 * c.repeated_fraction:.0f} %)"
         )
         rows.append(
             (
@@ -38,8 +40,8 @@ def channel_table(inspection: Inspection) -> str:
                 f"{100 * c.missing:.1f}",
                 f"{100 * c.lost:.1f}",
                 _number(c.longest_gap_s, 4),
-                "constant" if c.constant else held,
-                "never known" if not c.cells else f"{_number(c.low, 4)} to {_number(c.high, 4)}",
+                "constant" if c.constant else repeated,
+                "never known" if not c.known else f"{_number(c.low, 4)} to {_number(c.high, 4)}",
             )
         )
     header = (
@@ -50,7 +52,7 @@ def channel_table(inspection: Inspection) -> str:
         "missing %",
         "lost %",
         "longest gap s",
-        "held",
+        "repeated",
         "range",
     )
     return _table([header, *rows], left=(0, 1, 7, 8))
@@ -85,22 +87,24 @@ def episode_table(inspection: Inspection) -> str:
         "longest step s",
         "before it",
         "late",
-        "repeated",
+        "duplicates",
     )
     text = _table([header, *rows], left=(1, 5))
     if len(shown) == len(episodes):
         return text
     clean = len(episodes) - sum(_is_faulty(e) for _, e in episodes)
-    return f"{text}\n({len(episodes) - len(shown)} more; {clean} of {len(episodes)} without faults)"
+    return (
+        f"{text}\n({len(episodes) - len(shown)} more; {clean} of {len(episodes)} without anomalies)"
+    )
 
 
-def _before(episode: EpisodeFacts) -> str:
+def _before(episode: EpisodeInspection) -> str:
     if episode.outage_before_s is not None:
         return f"outage of {episode.outage_before_s:.4g} s"
     return "clock set" if episode.clock_set_before else ""
 
 
-def _is_faulty(episode: EpisodeFacts) -> bool:
+def _is_faulty(episode: EpisodeInspection) -> bool:
     return bool(
         episode.late
         or episode.duplicates

@@ -1,45 +1,47 @@
-"""What a log holds: rates, jitter, gaps, held values and faults, and what to make of them."""
+"""Inspection of a data set: rates, jitter, gaps, repeated values and anomalies."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.channels import find_held
-from offbeat.data.cleaning.options import sentences
+from offbeat.data.arrays import owned
+from offbeat.data.cleaning.channels import find_repeats, new_values
+from offbeat.data.cleaning.log import sentences
 from offbeat.data.trajectory import Dataset
 
 
 @dataclass(frozen=True)
-class ChannelFacts:
-    """What is known of a channel, over all episodes together.
+class ChannelInspection:
+    """A channel, over all episodes together.
 
     Attributes:
         name: of the channel.
         unit: or empty.
-        cells: known cells.
-        missing: share of the rows in which it is not known.
-        rate_hz: one over the median time between two known cells; None below two.
+        known: number of known values.
+        missing: fraction of the rows in which it is not known.
+        rate_hz: one over the median time between two known values; None below two.
         jitter_s: half the distance from the 5th to the 95th percentile of those times.
-        lost: share of the cells that its rate would give between its first and last one, and that
-            are not there; 0 where there are more.
-        longest_gap_s: the longest time between two known cells of an episode.
+        lost: fraction of the values that its rate would give between its first and last one, and
+            that are missing; 0 where there are more.
+        longest_gap_s: the longest time between two known values of an episode.
         longest_gap_at: the episode, counted from 0, and the time in it at which that gap begins.
-        rows_per_value: where it is held, the usual run of equal values, else 0.
-        held_share: share of known cells that repeat the one before.
+        rows_per_value: usual length of its runs of equal values, where a faster recording repeats
+            the values of a slower sensor, else 0.
+        repeated_fraction: fraction of known values that equal the one before.
         low: its least value; None where it is never known.
         high: its greatest.
         mean: its mean.
-        constant: whether it has one value alone.
+        constant: whether it has a single value.
     """
 
     name: str
     unit: str
-    cells: int
+    known: int
     missing: float
     rate_hz: float | None
     jitter_s: float | None
@@ -47,7 +49,7 @@ class ChannelFacts:
     longest_gap_s: float | None
     longest_gap_at: tuple[int, float] | None
     rows_per_value: int
-    held_share: float
+    repeated_fraction: float
     low: float | None
     high: float | None
     mean: float | None
@@ -55,8 +57,8 @@ class ChannelFacts:
 
 
 @dataclass(frozen=True)
-class EpisodeFacts:
-    """What is known of an episode.
+class EpisodeInspection:
+    """An episode.
 
     Attributes:
         label: as the file has it, or empty.
@@ -66,8 +68,8 @@ class EpisodeFacts:
         longest_step_s: the longest time between two rows.
         outage_before_s: the outage at which it was cut from the episode before; None where none is.
         clock_set_before: whether the clock was set before it.
-        late: rows that came out of order.
-        duplicates: rows that had the stamp of another.
+        late: rows out of order.
+        duplicates: rows with the time stamp of another row.
     """
 
     label: str
@@ -83,31 +85,31 @@ class EpisodeFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a log holds.
+    """What a data set holds.
 
     Attributes:
         source: the file, where it is known.
         format: of the file.
         time_unit: that the file counts in.
         rows: of all episodes together.
-        observed: share of the cells that are known.
+        known: fraction of the values that are known.
         rate_hz: one over the median time between two rows; None where no episode has two.
         channels: one entry each.
         episodes: one entry each.
-        found: what the policies found and did, a sentence each.
-        report: the same in full, see `ReaderOptions`; empty for data that were not read from a log.
+        found: what was found and done while reading, a sentence each.
+        cleaning: the same in full, see `CleaningLog`; empty for data that were not read.
     """
 
     source: str
     format: str
     time_unit: str
     rows: int
-    observed: float
+    known: float
     rate_hz: float | None
-    channels: tuple[ChannelFacts, ...]
-    episodes: tuple[EpisodeFacts, ...]
+    channels: tuple[ChannelInspection, ...]
+    episodes: tuple[EpisodeInspection, ...]
     found: tuple[str, ...]
-    report: dict[str, Any]
+    cleaning: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form."""
@@ -116,7 +118,7 @@ class Inspection:
 
 
 def inspect(dataset: Dataset) -> Inspection:
-    """Measures what a log holds, on the cells that are known.
+    """Measures what a data set holds, on the values that are known.
 
     Args:
         dataset: as `read` gives it.
@@ -124,32 +126,47 @@ def inspect(dataset: Dataset) -> Inspection:
     steps = np.concatenate([np.diff(t.times) for t in dataset])
     rows = sum(t.rows for t in dataset)
     channels = tuple(_channel(dataset, c, rows) for c in range(dataset.channels))
-    cells = sum(channel.cells for channel in channels)
-    report = dict(dataset.meta.get("report", {}))
+    known = sum(channel.known for channel in channels)
+    cleaning = dict(dataset.meta.get("cleaning", {}))
     return Inspection(
         source=str(dataset.meta.get("source", "")),
         format=str(dataset.meta.get("format", "offbeat")),
         time_unit=str(dataset.meta.get("time_unit", "s")),
         rows=rows,
-        observed=cells / (rows * dataset.channels),
+        known=known / (rows * dataset.channels),
         rate_hz=_rate(steps),
         channels=channels,
-        episodes=_episodes(dataset, report),
-        found=tuple(sentences(report)) if report else (),
-        report=report,
+        episodes=_episodes(dataset, cleaning),
+        found=tuple(sentences(cleaning)) if cleaning else (),
+        cleaning=cleaning,
     )
 
 
-def _channel(dataset: Dataset, c: int, rows: int) -> ChannelFacts:
+def without_repeats(dataset: Dataset) -> Dataset:
+    """The data set as `read` gives it with `repeated="mask"`: repeated values are not known."""
+    columns = [t.values.copy() for t in dataset]
+    for c, role in enumerate(dataset.roles):
+        found = None if role == "action" else find_repeats([v[:, c] for v in columns])
+        if found is not None:
+            for values in columns:
+                values[~new_values(values[:, c], found.rows_per_value), c] = np.nan
+    trajectories = tuple(
+        replace(t, values=owned(v), observed=owned(t.observed & ~np.isnan(v)))
+        for t, v in zip(dataset, columns, strict=True)
+    )
+    return replace(dataset, trajectories=trajectories)
+
+
+def _channel(dataset: Dataset, c: int, rows: int) -> ChannelInspection:
     columns = [t.values[:, c] for t in dataset]
     known = [np.flatnonzero(~np.isnan(column)) for column in columns]
     steps = [np.diff(t.times[at]) for t, at in zip(dataset, known, strict=True)]
     together = np.concatenate(steps)
-    cells = sum(len(at) for at in known)
-    facts = {"name": dataset.names[c], "unit": dataset.units[c], "cells": cells}
-    if not cells:
-        return ChannelFacts(
-            **facts,  # type: ignore[arg-type]
+    count = sum(len(at) for at in known)
+    described = {"name": dataset.names[c], "unit": dataset.units[c], "known": count}
+    if not count:
+        return ChannelInspection(
+            **described,  # type: ignore[arg-type]
             missing=1.0,
             rate_hz=None,
             jitter_s=None,
@@ -157,7 +174,7 @@ def _channel(dataset: Dataset, c: int, rows: int) -> ChannelFacts:
             longest_gap_s=None,
             longest_gap_at=None,
             rows_per_value=0,
-            held_share=0.0,
+            repeated_fraction=0.0,
             low=None,
             high=None,
             mean=None,
@@ -167,21 +184,21 @@ def _channel(dataset: Dataset, c: int, rows: int) -> ChannelFacts:
     low = min(float(v.min()) for v in values)
     high = max(float(v.max()) for v in values)
     repeats = sum(int(np.count_nonzero(v[1:] == v[:-1])) for v in values)
-    held = None if low == high else find_held(columns)
+    found = None if low == high else find_repeats(columns)
     gap, at = _longest(dataset, steps, known)
-    return ChannelFacts(
-        **facts,  # type: ignore[arg-type]
-        missing=1 - cells / rows,
+    return ChannelInspection(
+        **described,  # type: ignore[arg-type]
+        missing=1 - count / rows,
         rate_hz=_rate(together),
         jitter_s=_jitter(together),
         lost=_lost(together),
         longest_gap_s=gap,
         longest_gap_at=at,
-        rows_per_value=0 if held is None else held.rows_per_value,
-        held_share=repeats / max(sum(len(v) - 1 for v in values), 1),
+        rows_per_value=0 if found is None else found.rows_per_value,
+        repeated_fraction=repeats / max(sum(len(v) - 1 for v in values), 1),
         low=low,
         high=high,
-        mean=sum(float(v.sum()) for v in values) / cells,
+        mean=sum(float(v.sum()) for v in values) / count,
         constant=low == high,
     )
 
@@ -209,25 +226,25 @@ def _jitter(steps: NDArray[np.float64]) -> float | None:
 
 
 def _lost(steps: NDArray[np.float64]) -> float:
-    """Share of the cells that the median step would give, and that are not there."""
+    """Fraction of the values that the median step would give, and that are missing."""
     if not len(steps):
         return 0.0
     expected = float(steps.sum()) / float(np.median(steps))
     return max(0.0, 1 - len(steps) / expected)
 
 
-def _episodes(dataset: Dataset, report: dict[str, Any]) -> tuple[EpisodeFacts, ...]:
-    faults = {entry["episode"]: entry for entry in report.get("episodes", ())}
+def _episodes(dataset: Dataset, cleaning: dict[str, Any]) -> tuple[EpisodeInspection, ...]:
+    found = {entry["episode"]: entry for entry in cleaning.get("episodes", ())}
     labels = dataset.meta.get("labels", [""] * len(dataset))
-    # A part of the data, such as a split, has fewer trajectories than the report is of.
-    if len(labels) != len(dataset) or any(i >= len(dataset) for i in faults):
-        labels, faults = [""] * len(dataset), {}
-    facts = []
+    # A part of the data, such as a split, has fewer trajectories than the log.
+    if len(labels) != len(dataset) or any(i >= len(dataset) for i in found):
+        labels, found = [""] * len(dataset), {}
+    episodes = []
     for i, trajectory in enumerate(dataset):
-        own = faults.get(i, {})
+        own = found.get(i, {})
         steps = np.diff(trajectory.times)
-        facts.append(
-            EpisodeFacts(
+        episodes.append(
+            EpisodeInspection(
                 label=str(labels[i]),
                 origin=trajectory.origin,
                 rows=trajectory.rows,
@@ -239,4 +256,4 @@ def _episodes(dataset: Dataset, report: dict[str, Any]) -> tuple[EpisodeFacts, .
                 duplicates=int(own.get("duplicates", 0)),
             )
         )
-    return tuple(facts)
+    return tuple(episodes)

@@ -8,16 +8,17 @@ did in a log, and merges signals of different rates on the union of their time s
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from offbeat.data.arrays import owned
-from offbeat.data.cleaning import anomalies
-from offbeat.data.cleaning import channels as repairs
+from offbeat.data.cleaning.anomalies import merge_rows
+from offbeat.data.cleaning.channels import find_repeats, make_continuous, new_values, unwrap
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
+from offbeat.data.cleaning.log import CleaningLog
 from offbeat.data.cleaning.merging import Channels, Episode, cut
-from offbeat.data.cleaning.options import CleaningLog
 from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
 from offbeat.data.signals import Recording as Recording
 from offbeat.data.signals import Signal as Signal
@@ -25,77 +26,72 @@ from offbeat.data.trajectory import Dataset
 from offbeat.data.transforms import lowest_of
 from offbeat.errors import FileFormatError
 
-DEFAULT = ReaderOptions()
-"""The safe defaults."""
 
-
-def assemble(recordings: Iterable[Recording], policies: ReaderOptions = DEFAULT) -> Dataset:
-    """Makes a data set of recordings: merges their signals and applies the policies.
+def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = None) -> Dataset:
+    """Makes a data set of recordings: merges their signals and cleans them.
 
     In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
-    outages; held values, angles and quaternions per episode; resampling. Whether a channel is held
-    is found over all recordings together.
+    outages; actions, repeated values, angles and quaternions per episode; resampling. Whether a
+    channel repeats its values is found over all recordings together.
 
-    Memory: the arrays of a recording with one signal and no fault become those of its trajectory;
-    else there is, beside the result, one copy of the recordings at most.
+    The arrays of a recording with one signal and nothing to clean become those of its trajectory,
+    and read-only; else there is at most one copy of the recordings beside the result.
 
     Args:
         recordings: at least one, with a row; all are read before anything is returned.
-        policies: what to do about faults.
+        options: how to clean; by default `ReaderOptions()`.
 
     Returns:
-        A trajectory per recording, or several where it was split. `meta` holds `time_unit`, the
-        `report` of what each policy did, `labels` (where recordings have them) and `clock_start`
-        (what the recording's clock showed at time 0, in `time_unit`, where that was not 0), each
-        with an entry per trajectory.
+        A trajectory per recording, or several where it was split. `meta` holds `time_unit`, the log
+        of the `cleaning`, `labels` (where recordings have them) and `clock_start` (the recording's
+        clock at time 0, in `time_unit`, where that is not 0), each with an entry per trajectory.
 
     Raises:
-        FileFormatError: a policy refuses, or nothing is left.
-        InputError: `channels`, `without` or `angles` names a channel that there is not.
+        FileFormatError: an option refuses what was found, or nothing is left.
+        InputError: an option names a channel that does not exist.
     """
+    options = options or ReaderOptions()
     waiting: list[Recording | None] = list(recordings)
     given = [recording for recording in waiting if recording is not None]
-    channels = Channels.of(given, policies)
+    channels = Channels.of(given, options)
     unit = _common([recording.time_unit for recording in given], "ns")
     labelled = any(recording.label for recording in given)
     del given
-    account = CleaningLog(
-        quaternions=[list(channels.names_of(four)) for four in channels.quaternions]
-    )
+    log = CleaningLog(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
     episodes: list[Episode] = []
     for i, recording in enumerate(waiting):
         assert recording is not None
-        waiting[i] = None  # its arrays go as soon as they are merged
-        account.notes |= dict.fromkeys(recording.notes)
-        episodes += cut(recording, channels, policies, account)
+        waiting[i] = None  # frees its arrays as soon as they are merged
+        log.notes |= dict.fromkeys(recording.notes)
+        episodes += cut(recording, channels, options, log)
     if not episodes:
         raise FileFormatError(
             "there is no row to read: every recording is empty, or was left out as too short "
-            f"(min_rows {policies.min_rows}); check the file, or give a smaller min_rows"
+            f"(min_rows {options.min_rows}); check the file, or give a smaller min_rows"
         )
     for episode in episodes:
         _hold_actions(episode, channels)
-    _mask_held(episodes, channels, policies, account)
-    if policies.unwrap:
-        _unwrap(episodes, channels, account)
-    if policies.quaternions == "continuous":
+    _mask_repeats(episodes, channels, options, log)
+    if options.unwrap:
+        _unwrap(episodes, channels, log)
+    if options.quaternions == "continuous":
         for episode in episodes:
-            _mend(episode, channels, account)
-    if policies.resample_hz is not None:
+            _make_continuous(episode, channels, log)
+    if options.resample_hz is not None:
         for episode in episodes:
-            _resample(episode, policies.resample_hz)
+            _resample(episode, options.resample_hz)
             _hold_actions(episode, channels)
     for episode in episodes:
         owned(episode.values)
-    trajectories = tuple(episode.trajectory(channels, policies) for episode in episodes)
+    trajectories = tuple(episode.trajectory(channels, options) for episode in episodes)
     meta: dict[str, Any] = {"time_unit": unit}
     if labelled:
         meta["labels"] = [episode.label for episode in episodes]
     starts = [_clock(episode, unit) for episode in episodes]
-    if policies.start == "first_row" and any(starts):
+    if options.start == "first_row" and any(starts):
         meta["clock_start"] = starts
-    faulty = [{"episode": i, **e.faults} for i, e in enumerate(episodes) if e.faults]
-    return Dataset(trajectories, {**meta, "report": account.report(policies, faulty)})
+    found = [{"episode": i, **e.anomalies} for i, e in enumerate(episodes) if e.anomalies]
+    return Dataset(trajectories, {**meta, "cleaning": log.to_dict(options, found)})
 
 
 def _hold_actions(episode: Episode, channels: Channels) -> None:
@@ -110,48 +106,48 @@ def _hold_actions(episode: Episode, channels: Channels) -> None:
         column[:] = column[np.where(latest < 0, first, latest)]
 
 
-def _mask_held(
-    episodes: list[Episode], channels: Channels, policies: ReaderOptions, account: CleaningLog
+def _mask_repeats(
+    episodes: list[Episode], channels: Channels, options: ReaderOptions, log: CleaningLog
 ) -> None:
     for c, name in enumerate(channels.names):
         if channels.roles[c] == "action":
-            continue  # a command that repeats is a command
-        held = repairs.find_held([episode.values[:, c] for episode in episodes])
-        if held is None:
             continue
-        account.held[name] = {"share": held.share, "rows_per_value": held.rows_per_value}
-        if policies.held == "mask":
+        found = find_repeats([episode.values[:, c] for episode in episodes])
+        if found is None:
+            continue
+        log.repeated[name] = asdict(found)
+        if options.repeated == "mask":
             for episode in episodes:
                 column = episode.own()[:, c]
-                repeats = ~repairs.measured_anew(column, held.rows_per_value) & ~np.isnan(column)
+                repeats = ~np.isnan(column) & ~new_values(column, found.rows_per_value)
                 column[repeats] = np.nan
-                account.masked += int(repeats.sum())
+                log.masked += int(repeats.sum())
 
 
-def _unwrap(episodes: list[Episode], channels: Channels, account: CleaningLog) -> None:
+def _unwrap(episodes: list[Episode], channels: Channels, log: CleaningLog) -> None:
     for c, period in channels.angles.items():
         name = channels.names[c]
         low = np.fmin.reduce([np.fmin.reduce(episode.values[:, c]) for episode in episodes])
         high = np.fmax.reduce([np.fmax.reduce(episode.values[:, c]) for episode in episodes])
-        turns = sum(repairs.unwrap(episode.own()[:, c], period) for episode in episodes)
+        turns = sum(unwrap(episode.own()[:, c], period) for episode in episodes)
         if turns:
-            account.turns[name] += turns
+            log.turns[name] += turns
         lowest = lowest_of(float(low), float(high), period) if turns else None
-        account.angles[name] = {"period": period, "lowest": lowest}
+        log.angles[name] = {"period": period, "lowest": lowest}
 
 
-def _mend(episode: Episode, channels: Channels, account: CleaningLog) -> None:
+def _make_continuous(episode: Episode, channels: Channels, log: CleaningLog) -> None:
     for four in channels.quaternions:
         part = episode.own()[:, list(four)]
-        mended = repairs.mend_quaternion(part)
+        changes = make_continuous(part)
         episode.values[:, list(four)] = part
-        account.flipped += mended.flipped
-        account.renormalised += mended.renormalised
-        account.dropped += mended.dropped
+        log.flipped += changes.flipped
+        log.renormalised += changes.renormalised
+        log.dropped += changes.dropped
 
 
 def _resample(episode: Episode, rate_hz: float) -> None:
-    """Rows at a fixed rate from the first stamp on, each with what was measured since the last."""
+    """Rows at a fixed rate from the first stamp on, with the last values since the row before."""
     since = episode.stamps - episode.stamps[0]
     rows = int(np.ceil(since[-1] * rate_hz / 1e9 - 1e-6)) + 1
     grid = np.rint(np.arange(rows) * (1e9 / rate_hz)).astype(np.int64)
@@ -159,7 +155,7 @@ def _resample(episode: Episode, rate_hz: float) -> None:
     row = np.minimum(row, rows - 1)
     starts = np.flatnonzero(np.diff(row, prepend=-1))
     values = np.full((rows, episode.values.shape[1]), np.nan, order="F")
-    values[row[starts]] = anomalies.merge_rows(episode.values, starts, "last")
+    values[row[starts]] = merge_rows(episode.values, starts, "last")
     episode.stamps, episode.values, episode.owned = grid + episode.stamps[0], values, True
 
 

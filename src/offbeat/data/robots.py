@@ -1,7 +1,7 @@
-"""The robots that can be simulated: one entry each, on the models of the DeepMind Control Suite.
+"""The robots that can be simulated, as MuJoCo models with a draw of initial states.
 
-The model files come with the `dm_control` package, which is found and not imported: importing it
-takes seconds and chooses a rendering backend, and all that is needed of it here is its XML.
+The built-in ones are models of the DeepMind Control Suite. Their files come with the `dm_control`
+package, which is found and not imported: that takes seconds and chooses a rendering backend.
 """
 
 from __future__ import annotations
@@ -15,37 +15,127 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.errors import MissingExtraError, one_of, require
+from offbeat.data.source import require_file
+from offbeat.errors import FileFormatError, InputError, MissingExtraError, require
+from offbeat.registry import Registry
 
 Draw = Callable[[np.random.RandomState, Any, int], NDArray[np.float64]]
-"""Draws (n, nq + nv) initial states for a compiled model: positions, then velocities, SI units."""
+"""Draws (n, nq + nv) initial states for a `mujoco.MjModel`: positions, then velocities, in SI."""
+
+Control = Callable[[float, NDArray[np.float64]], NDArray[np.float64]]
+"""Gives the (nu,) controls at a time (s) for the (nq + nv,) positions and velocities then."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot: its model file and the distribution of its initial states.
+    """A robot: its model, the distribution of its initial states, and its controller.
 
     Args:
-        name: the name users give.
-        xml: name of the MJCF file in the suite's folder of `dm_control`.
-        description: one line, for lists and reports.
+        name: for lists, channels' origins and `meta`.
+        model: MJCF file, or a function that makes the `mujoco.MjModel`.
         draw: draws initial states, trajectory by trajectory, so that the first k of n trajectories
-            do not depend on n.
+            do not depend on n. By default joints with limits anywhere in their range, hinges
+            without at any angle, and velocities of up to 1 in SI units.
+        control: by default no control.
+        description: one line, for lists.
     """
 
     name: str
-    xml: str
-    description: str
-    draw: Draw
+    model: str | Path | Callable[[], Any]
+    draw: Draw | None = None
+    control: Control | None = None
+    description: str = ""
+
+    def initial_states(
+        self, random: np.random.RandomState, model: Any, n: int
+    ) -> NDArray[np.float64]:
+        """(n, nq + nv) initial states.
+
+        Raises:
+            InputError: the sampler gives another shape, or there is none for such joints.
+        """
+        states = np.asarray((self.draw or inside_joint_ranges(1.0))(random, model, n))
+        if states.shape != (n, model.nq + model.nv):
+            raise InputError(
+                f"the sampler of robot {self.name!r} must give initial states of shape "
+                f"{(n, model.nq + model.nv)}, got {states.shape}"
+            )
+        return states.astype(np.float64)
 
     def __repr__(self) -> str:
         return f"Robot({self.name!r}: {self.description})"
 
 
+ROBOTS: Registry[Robot] = Registry("robot", group="offbeat.robots")
+"""The robots that can be simulated by name."""
+
+
+def register_robot(
+    name: str,
+    model: str | Path | Callable[[], Any],
+    *,
+    draw: Draw | None = None,
+    control: Control | None = None,
+    description: str = "",
+    replace: bool = False,
+) -> Robot:
+    """Adds a robot to those that `simulate` knows by name.
+
+    Args:
+        name: what users say.
+        model: as of `Robot`.
+        draw: as of `Robot`.
+        control: as of `Robot`.
+        description: as of `Robot`.
+        replace: allow a name that is taken.
+
+    Raises:
+        InputError: the name is taken.
+    """
+    return ROBOTS.register(name, Robot(name, model, draw, control, description), replace=replace)
+
+
+def robot_of(robot: str | Path | Robot) -> Robot:
+    """A robot by its name, or of an MJCF file.
+
+    Raises:
+        InputError: it is neither; the message lists the names.
+    """
+    if isinstance(robot, Robot):
+        return robot
+    if isinstance(robot, Path) or robot.endswith(".xml"):
+        return Robot(str(robot), robot)
+    return ROBOTS[robot]
+
+
+def load_model(robot: str | Path | Robot) -> Any:
+    """Compiles the model of a robot: a `mujoco.MjModel`, for simulation and for rendering.
+
+    Args:
+        robot: name, MJCF file, or robot.
+
+    Raises:
+        InputError: the robot is unknown.
+        FileFormatError: the file is missing or no MJCF.
+        MissingExtraError: mujoco or dm_control is not installed.
+    """
+    source = robot_of(robot).model
+    mujoco = require("mujoco", "sim")
+    if callable(source):
+        return source()
+    path = require_file(source)
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise FileFormatError(
+            f"{path} cannot be compiled as MJCF ({' '.join(str(error).split())})"
+        ) from None
+
+
 def _box(*sides: tuple[int, float, float]) -> Draw:
     """Independent uniform draws: (how many entries, low, high) per side of the box.
 
-    `uniform` with arrays gives, bit for bit, what one call per side gives in a loop.
+    One call of `uniform` with arrays gives, bit for bit, what a call per side gives.
     """
     counts, lows, highs = zip(*sides, strict=True)
     low, high = np.repeat(lows, counts), np.repeat(highs, counts)
@@ -56,13 +146,18 @@ def _box(*sides: tuple[int, float, float]) -> Draw:
     return draw
 
 
-def _inside_joint_ranges(speed: float) -> Draw:
-    """Limited joints anywhere in their range, free hinges at any angle, free slides where they are.
+def inside_joint_ranges(speed: float) -> Draw:
+    """Draws joints with limits in their range, other hinges at any angle, and leaves other slides.
 
-    For models of slide and hinge joints. Velocities are uniform in plus or minus `speed`.
+    Velocities are uniform in plus or minus `speed`.
     """
 
     def draw(random: np.random.RandomState, model: Any, n: int) -> NDArray[np.float64]:
+        if model.nq != model.njnt:
+            raise InputError(
+                "initial states can be drawn without a sampler for slide and hinge joints alone; "
+                "give the robot draw=, or initial_states="
+            )
         limited = model.jnt_limited.astype(bool)
         hinge = model.jnt_type == require("mujoco", "sim").mjtJoint.mjJNT_HINGE.value
         reach = np.where(hinge, np.pi, 0.0)
@@ -75,60 +170,24 @@ def _inside_joint_ranges(speed: float) -> Draw:
     return draw
 
 
-ROBOTS = {
-    robot.name: robot
-    for robot in (
-        Robot(
-            "hopper",
-            "hopper.xml",
-            "a planar one-legged hopper: 7 joints, 14 channels, 5 ms",
-            # The protocol's draw: qpos[0:2], qpos[2:7], qvel; joint ranges are not respected.
-            _box((2, 0.0, 0.5), (5, -2.0, 2.0), (7, -5.0, 5.0)),
-        ),
-        Robot(
-            "walker",
-            "walker.xml",
-            "a planar two-legged walker: 9 joints, 18 channels, 2.5 ms",
-            _inside_joint_ranges(speed=5.0),
-        ),
-    )
-}
-"""The robots by name. A new robot is a new entry."""
+def _suite_model(xml: str) -> Callable[[], Any]:
+    """Compiles a model of the DeepMind Control Suite."""
 
+    def model() -> Any:
+        suite = _suite_folder()
+        try:
+            text = (suite / xml).read_text(encoding="utf-8")
+            # The suite's models include these under exactly this spelling.
+            common = sorted((suite / "common").glob("*.xml"))
+            assets = {f"./common/{file.name}": file.read_bytes() for file in common}
+        except OSError as error:
+            raise MissingExtraError(
+                f"the installed dm_control lacks {xml} ({error}); reinstall it with: "
+                "pip install --force-reinstall dm_control"
+            ) from None
+        return require("mujoco", "sim").MjModel.from_xml_string(text, assets)
 
-def robot_named(name: str) -> Robot:
-    """The robot of this name.
-
-    Raises:
-        InputError: there is none; the message lists the names.
-    """
-    return ROBOTS[one_of("robot", name, ROBOTS)]
-
-
-def load_model(name: str) -> Any:
-    """Compiles the model of a robot: a `mujoco.MjModel`, for simulation and for rendering.
-
-    Args:
-        name: one of `ROBOTS`.
-
-    Raises:
-        InputError: the robot is unknown.
-        MissingExtraError: mujoco or dm_control is not installed.
-    """
-    robot = robot_named(name)
-    mujoco = require("mujoco", "sim")
-    suite = _suite_folder()
-    try:
-        xml = (suite / robot.xml).read_text(encoding="utf-8")
-        # The suite's models include these under exactly this spelling.
-        common = sorted((suite / "common").glob("*.xml"))
-        assets = {f"./common/{file.name}": file.read_bytes() for file in common}
-    except OSError as error:
-        raise MissingExtraError(
-            f"the installed dm_control lacks the model of {name!r} ({error}); "
-            "reinstall it with: pip install --force-reinstall dm_control"
-        ) from None
-    return mujoco.MjModel.from_xml_string(xml, assets)
+    return model
 
 
 def _suite_folder() -> Path:
@@ -140,6 +199,20 @@ def _suite_folder() -> Path:
         )
     return Path(spec.submodule_search_locations[0]) / "suite"
 
+
+register_robot(
+    "hopper",
+    _suite_model("hopper.xml"),
+    # The draw of the thesis: qpos[0:2], qpos[2:7], qvel; joint ranges are not respected.
+    draw=_box((2, 0.0, 0.5), (5, -2.0, 2.0), (7, -5.0, 5.0)),
+    description="a planar one-legged hopper: 7 joints, 14 channels, 5 ms",
+)
+register_robot(
+    "walker",
+    _suite_model("walker.xml"),
+    draw=inside_joint_ranges(5.0),
+    description="a planar two-legged walker: 9 joints, 18 channels, 2.5 ms",
+)
 
 _QUATERNION = [(f"q{axis}", "1") for axis in "wxyz"]
 _POSITION = [(axis, "m") for axis in "xyz"]
@@ -173,3 +246,8 @@ def channels_of(model: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
                 names.append("_".join(filter(None, (joint, suffix, kind))))
                 units.append(unit)
     return tuple(names), tuple(units)
+
+
+def controls_of(model: Any) -> tuple[str, ...]:
+    """Names of a model's controls, such as `knee_ctrl`, one per actuator."""
+    return tuple(f"{model.actuator(i).name or f'actuator{i}'}_ctrl" for i in range(model.nu))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from offbeat.data.cleaning.log import upgraded
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError
 
@@ -182,6 +183,8 @@ def _upgraded(fields: dict[str, Any]) -> dict[str, Any]:
     count = fields.pop("actions") or 0
     columns = [f"action|{i}" for i in range(count)]
     called = meta.pop("actions", [])
+    if isinstance(meta.get("report"), dict) and "held" in meta["report"]:
+        meta["cleaning"] = upgraded(meta.pop("report"))
     if len(called) != count or set(called) & set(names):
         called = [f"action[{i}]" for i in range(count)]
     return fields | {

@@ -1,4 +1,4 @@
-"""Passive trajectories of simulated robots: no control, one row per physics step."""
+"""Trajectories of simulated robots: one row per physics step."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import importlib.metadata
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from offbeat.data.robots import channels_of, load_model, robot_named
+from offbeat.data.arrays import owned
+from offbeat.data.robots import Control, Robot, channels_of, controls_of, load_model, robot_of
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import DivergenceError, InputError, require
 
@@ -21,25 +23,31 @@ _ROWS_PER_CHUNK = 32_768  # about a quarter of a second: the progress bar moves,
 
 
 def simulate(
-    robot: str = "hopper",
+    robot: str | Path | Robot = "hopper",
     n_trajectories: int = 10_000,
     rows: int = 200,
     *,
+    controls: Control | ArrayLike | None = None,
     seed: int = 0,
     initial_states: ArrayLike | None = None,
     threads: int | None = None,
     progress: bool = True,
 ) -> Dataset:
-    """Simulates a robot that falls, bounces and comes to rest under zero control.
+    """Simulates a robot: without controls, it falls, bounces and comes to rest.
 
-    The first row of a trajectory is its initial state, and one row follows per physics step.
-    The same arguments give the same bytes whatever `threads` is, and the first trajectories of a
-    larger data set are those of a smaller one.
+    The first row of a trajectory is its initial state, and one row follows per physics step. With
+    controls, each row also has those that act from it to the next row, as channels with the role
+    `action`. The same arguments give the same bytes whatever `threads` is, and the first
+    trajectories of a larger data set are those of a smaller one.
 
     Args:
-        robot: name of the robot, one of `offbeat.data.robots.ROBOTS`.
+        robot: name of the robot, one of `offbeat.data.robots.ROBOTS`; an MJCF file; or a `Robot`.
         n_trajectories: how many to simulate; with `initial_states`, their number counts.
         rows: rows per trajectory, at least 2.
+        controls: a function of the time (s) and the (nq + nv,) positions and velocities that gives
+            (nu,) controls, or recorded ones, (rows, nu) for all trajectories or
+            (n, rows, nu); by default those of the robot, or none. A function is called in one
+            thread.
         seed: seed of the initial states, 0 to 2**32 - 1.
         initial_states: (n, nq + nv) positions, then velocities, instead of the robot's own draw.
         threads: how many to use; by default one per core that this process may run on.
@@ -51,33 +59,52 @@ def simulate(
 
     Raises:
         InputError: the robot is unknown, or an argument is out of bounds.
+        FileFormatError: the MJCF file is missing or cannot be compiled.
         MissingExtraError: mujoco or dm_control is not installed.
         DivergenceError: a simulation became unstable.
     """
-    entry = robot_named(robot)
+    entry = robot_of(robot)
     n_trajectories = _at_least("n_trajectories", n_trajectories, 1)
     rows = _at_least("rows", rows, 2)
     threads = available_cores() if threads is None else _at_least("threads", threads, 1)
     random = _random_state(seed)
-    model = load_model(robot)
+    model = load_model(entry)
     if initial_states is None:
-        states = entry.draw(random, model, n_trajectories)
+        states = entry.initial_states(random, model, n_trajectories)
     else:
         states = _given_states(initial_states, model)
-    values = _roll_out(robot, model, states, rows, threads, progress)
+    given = controls if controls is not None else entry.control
     names, units = channels_of(model)
+    if callable(given):
+        kind = "function"
+        values, acted = _step(entry.name, model, states, rows, given, progress)
+    elif given is not None:
+        kind = "recorded"
+        acted = _recorded(given, (len(states), rows, model.nu))
+        values = _roll_out(entry.name, model, states, rows, threads, progress, acted)
+    else:
+        kind = "zero"
+        values = _roll_out(entry.name, model, states, rows, threads, progress)
+    roles = ("state",) * len(names)
+    if given is not None:
+        values = np.concatenate([values, acted], axis=2)
+        names, units = (*names, *controls_of(model)), (*units, *[""] * model.nu)
+        roles = (*roles, *["action"] * model.nu)
     timestep = float(model.opt.timestep)
-    times = np.arange(rows, dtype=np.float64) * timestep
+    times = owned(np.arange(rows, dtype=np.float64) * timestep)
+    owned(values)
     return Dataset(
         tuple(
-            Trajectory(times, value, names=names, units=units, origin=f"{robot} {i}")
+            Trajectory(
+                times, value, names=names, units=units, roles=roles, origin=f"{entry.name} {i}"
+            )
             for i, value in enumerate(values)
         ),
         meta={
-            "robot": robot,
+            "robot": entry.name,
             "seed": None if initial_states is not None else int(seed),
             "timestep_s": timestep,
-            "control": "zero",
+            "control": kind,
             "versions": _versions(),
         },
     )
@@ -97,12 +124,12 @@ def _roll_out(
     rows: int,
     threads: int,
     progress: bool,
+    controls: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Steps every initial state: (n, nq + nv) to (n, rows, nq + nv)."""
+    """Steps every initial state: (n, nq + nv), with (n, rows, nu), to (n, rows, nq + nv)."""
     mujoco = require("mujoco", "sim")
     rollout = require("mujoco.rollout", "sim")
-    # An unstable state must stay to be seen, not be replaced by the model's default state.
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
+    _keep_unstable_states(mujoco, model)
     data = [mujoco.MjData(model) for _ in range(threads)]
     full = np.zeros((len(states), mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     # The full state is the time, the positions, the velocities, and internal variables at rest.
@@ -122,13 +149,74 @@ def _roll_out(
     ):
         for start in range(0, len(states), chunk):
             part = slice(start, min(start + chunk, len(states)))
-            # After a warning the rollout repeats the row it came with. The one step too many makes
-            # that show in the clock for warnings of the last row, too.
-            stepped, _ = pool.rollout(model, data, full[part], nstep=rows)
+            # After a warning the rollout repeats that row. One step more than needed lets the clock
+            # show it for warnings of the last row, too.
+            acted = None if controls is None else controls[part]
+            stepped, _ = pool.rollout(model, data, full[part], acted, nstep=rows)
             _check_stable(robot, stepped, start, warnings)
             values[part, 1:] = stepped[:, : rows - 1, 1 : 1 + width]
             bar.update(part.stop - part.start)
     return values
+
+
+def _step(
+    robot: str,
+    model: Any,
+    states: NDArray[np.float64],
+    rows: int,
+    control: Control,
+    progress: bool,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As `_roll_out`, with the controls of a function, which are returned, too."""
+    mujoco = require("mujoco", "sim")
+    _keep_unstable_states(mujoco, model)
+    values = np.empty((len(states), rows, states.shape[1]))
+    acted = np.empty((len(states), rows, model.nu))
+    stepped = np.empty((1, rows, 1 + states.shape[1]))
+    show = None if progress else True
+    with _collected_warnings(mujoco) as warnings:
+        for i in tqdm(range(len(states)), desc=robot, unit=" trajectories", disable=show):
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = states[i, : model.nq], states[i, model.nq :]
+            values[i, 0] = states[i]
+            stepped[:] = np.nan
+            for row in range(rows):
+                given = np.asarray(control(data.time, values[i, row].copy()), dtype=np.float64)
+                if given.shape != (model.nu,) or not np.isfinite(given).all():
+                    raise InputError(
+                        f"controls of {robot!r} must be {model.nu} finite numbers, got "
+                        f"{given.tolist()} for trajectory {i}, row {row}"
+                    )
+                acted[i, row] = data.ctrl[:] = given
+                mujoco.mj_step(model, data)
+                if np.any(data.warning.number):
+                    break
+                stepped[0, row] = np.concatenate([[data.time], data.qpos, data.qvel])
+                if row + 1 < rows:
+                    values[i, row + 1] = stepped[0, row, 1:]
+            _check_stable(robot, stepped, i, warnings)
+    return values, acted
+
+
+def _keep_unstable_states(mujoco: Any, model: Any) -> None:
+    """Turns off that an unstable state is replaced by the model's default state."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
+
+
+def _recorded(controls: Any, shape: tuple[int, int, int]) -> NDArray[np.float64]:
+    """(n, rows, nu) recorded controls, checked."""
+    try:
+        given = np.asarray(controls, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"controls must be a function or numbers: {error}") from None
+    if given.shape not in (shape, shape[1:]):
+        raise InputError(
+            f"controls must have the shape {shape} (trajectories, rows, controls), or {shape[1:]} "
+            f"for all trajectories, got {given.shape}"
+        )
+    if not np.isfinite(given).all():
+        raise InputError("controls must be finite")
+    return np.broadcast_to(given, shape).copy()
 
 
 def _check_stable(
@@ -167,7 +255,7 @@ def _at_least(name: str, value: int, low: int) -> int:
 def _random_state(seed: int) -> np.random.RandomState:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**32:
         raise InputError(f"seed must be an integer from 0 to {2**32 - 1}, got {seed!r}")
-    # The legacy generator: its stream is frozen, and the protocol's draw is defined by it.
+    # The legacy generator, whose numbers never change: the draw of the thesis is defined by it.
     return np.random.RandomState(int(seed))
 
 
@@ -192,7 +280,10 @@ def _given_states(initial_states: ArrayLike, model: Any) -> NDArray[np.float64]:
 
 
 def _versions() -> dict[str, str]:
-    from offbeat import __version__  # late: the package's front page imports this module
+    from offbeat import __version__  # the package imports this module
 
-    packages = ("mujoco", "dm_control", "numpy")
-    return {"offbeat": __version__} | {name: importlib.metadata.version(name) for name in packages}
+    versions = {"offbeat": __version__}
+    for name in ("mujoco", "dm_control", "numpy"):
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions[name] = importlib.metadata.version(name)
+    return versions

@@ -1,4 +1,4 @@
-"""Faults of clocks: rows out of order, stamps that repeat, clocks that are set, outages."""
+"""Anomalies of clocks: rows out of order, repeated time stamps, clock jumps, outages."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Values = NDArray[np.float64]
 _DAY = 86_400 * 10**9
 _SECOND = 10**9
 _FEW_STEPS = 20
-_LATE_ROWS = 10  # rows after which a stamp that is late, and not set back, is over
+_LATE_ROWS = 10  # after so many rows a step back is no late row
 
 
 @dataclass(frozen=True, eq=False)
 class Disorder:
-    """What is wrong with the order of stamps.
+    """Anomalies of the order of time stamps.
 
     Attributes:
         late: stamps of the rows that are lower than one before them.
@@ -32,7 +32,7 @@ class Disorder:
 
     @property
     def any(self) -> bool:
-        """Whether there is a fault."""
+        """Whether there is an anomaly."""
         return len(self.late) + len(self.duplicates) > 0
 
 
@@ -50,11 +50,11 @@ def disorder(stamps: Stamps) -> Disorder:
 
 
 def clock_jumps(stamps: Stamps) -> Stamps:
-    """Rows at which the clock was set: back for good, or forth by more than a day (and 20 steps).
+    """Rows at which the clock was set: back for good, or forward by more than a day (and 20 steps).
 
     A step back counts if it is longer than a second and than 20 median steps, and if none of the
-    10 rows that follow reaches the old clock again; else the row is late, and not the clock wrong.
-    Where more than 1 row in 100 steps back so, the log has no order, rather than many clocks.
+    10 rows that follow reaches the old clock again; else the row is late. Where more than 1 row in
+    100 steps back so, the rows are out of order, and no clock was set.
     """
     steps = np.diff(stamps)
     if not len(steps) or ((steps >= 0) & (steps <= _DAY)).all():
@@ -66,23 +66,23 @@ def clock_jumps(stamps: Stamps) -> Stamps:
         back = back[:0]
     after = np.minimum(back[:, None] + np.arange(1, _LATE_ROWS + 1), len(stamps) - 1)
     stays = (stamps[after] < stamps[back - 1][:, None]).all(axis=1)
-    # At the very end there is nothing after it to tell by.
+    # After the last row there is nothing to compare with.
     back = back[stays & (back < len(stamps) - 1)]
     far = max(_DAY, 20 * usual)
-    forth = np.flatnonzero(steps > far) + 1
-    # A forward step that merely ends a late stamp is none.
+    ahead = np.flatnonzero(steps > far) + 1
+    # A forward step that ends a late stamp is none.
     reached = np.maximum.accumulate(stamps)
-    forth = forth[stamps[forth] - reached[forth - 1] > far]
-    return np.union1d(back, forth)
+    ahead = ahead[stamps[ahead] - reached[ahead - 1] > far]
+    return np.union1d(back, ahead)
 
 
 def in_order(
-    stamps: Stamps, values: Values, policy: Literal["sort", "drop", "refuse"]
+    stamps: Stamps, values: Values, choice: Literal["sort", "drop", "refuse"]
 ) -> tuple[Stamps, Values]:
     """Stamps that do not decrease, with their values; `refuse` is up to the caller."""
     if (np.diff(stamps) >= 0).all():
         return stamps, values
-    if policy == "drop":
+    if choice == "drop":
         kept = stamps >= np.maximum.accumulate(stamps)
         return stamps[kept], values[kept]
     order = np.argsort(stamps, kind="stable")
@@ -90,38 +90,38 @@ def in_order(
 
 
 def one_row_per_stamp(
-    stamps: Stamps, values: Values, policy: Literal["last", "first", "mean", "refuse"]
+    stamps: Stamps, values: Values, choice: Literal["last", "first", "mean", "refuse"]
 ) -> tuple[Stamps, Values]:
-    """Merges rows of one stamp, channel by channel, over the cells that are known."""
+    """Merges rows of one stamp, channel by channel, over the values that are known."""
     starts = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1) != 0)
     if len(starts) == len(stamps):
         return stamps, values
-    return stamps[starts], merge_rows(values, starts, policy)
+    return stamps[starts], merge_rows(values, starts, choice)
 
 
 def merge_rows(
-    values: Values, starts: NDArray[np.int64], policy: Literal["last", "first", "mean", "refuse"]
+    values: Values, starts: NDArray[np.int64], choice: Literal["last", "first", "mean", "refuse"]
 ) -> Values:
-    """One row per group of rows: the `last` or `first` known cell per channel, or the `mean`.
+    """One row per group of rows: the `last` or `first` known value per channel, or the `mean`.
 
     Args:
         values: (n, channels) NaN = missing.
         starts: (groups,) first row of each group, increasing from 0.
-        policy: which; `refuse` is taken as `last`.
+        choice: which; `refuse` counts as `last`.
 
     Returns:
         (groups, channels).
     """
     merged = np.empty((len(starts), values.shape[1]), order="F")
     rows = np.arange(len(values))
-    for c in range(values.shape[1]):  # column by column: the memory of one column beside it
+    for c in range(values.shape[1]):  # column by column, to save memory
         column = values[:, c]
         known = ~np.isnan(column)
-        if policy == "mean":
+        if choice == "mean":
             total = np.add.reduceat(np.where(known, column, 0.0), starts)
             count = np.add.reduceat(known.astype(np.int64), starts)
             merged[:, c] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-        elif policy == "first":
+        elif choice == "first":
             at = np.minimum.reduceat(np.where(known, rows, len(values) - 1), starts)
             own = known[at] & (at < np.append(starts[1:], len(values)))
             merged[:, c] = np.where(own, column[at], np.nan)
@@ -132,7 +132,7 @@ def merge_rows(
 
 
 def union(signals: list[tuple[Stamps, Values, list[int]]], channels: int) -> tuple[Stamps, Values]:
-    """Merges signals on the union of their stamps; what a signal did not say at a stamp is NaN.
+    """Merges signals on the union of their stamps; values that a signal lacks at a stamp are NaN.
 
     Args:
         signals: stamps that increase strictly, values, and the channel of each column.
@@ -162,7 +162,7 @@ def longest_allowed(stamps: Stamps, max_gap_s: float | Literal["auto"] | None) -
     """Nanoseconds above which a step is an outage; None where none is.
 
     `auto` is 20 times the 95th percentile of the steps, the longest one left out, and at least 1 s;
-    fewer than 20 steps say too little of what is usual, and none of them is an outage.
+    with fewer than 20 steps there is no outage.
     """
     if max_gap_s is None:
         return None

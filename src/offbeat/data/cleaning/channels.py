@@ -1,4 +1,4 @@
-"""Faults of channels: values held on a faster grid, angles that wrap, quaternions that flip."""
+"""Anomalies of channels: repeated values, angles that wrap, quaternions that change sign."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
 
-HELD_SHARE = 0.5
-"""Share of rows that repeat the value before them, from which on a channel can be held."""
+REPEATED_FRACTION = 0.5
+"""Least fraction of values that equal the one before, for a channel to count as repeated."""
 
 _FEWEST_RUNS = 10
 _BLOCK = 1 << 14  # rows that stay in cache while they are looked at
@@ -21,24 +21,24 @@ _ROTATION = re.compile(r"q$|quat|orient|rotation|attitude|(^|[._\s\-/])q", re.IG
 
 
 @dataclass(frozen=True)
-class Held:
-    """A channel of a slower sensor that a faster log repeats.
+class Repeats:
+    """How a recording at a higher rate repeats the values of a slower sensor.
 
     Attributes:
-        share: of its known cells that repeat the one before.
+        fraction: of its known values that equal the one before.
         rows_per_value: the usual (median) length of its runs of equal values, 2 or more.
     """
 
-    share: float
+    fraction: float
     rows_per_value: int
 
 
-def find_held(columns: Sequence[Values]) -> Held | None:
-    """Says whether a channel is held.
+def find_repeats(columns: Sequence[Values]) -> Repeats | None:
+    """Finds out whether a channel repeats the values of a slower sensor.
 
-    Held is a channel at least half of whose known cells repeat the one before, in 10 runs of equal
-    values or more whose median length is 2 or more. One that rests, and between its rests changes
-    at every row, has mostly short runs, and is not held; a constant has no run that ends.
+    It does where at least half of its known values equal the one before, in 10 runs of equal values
+    or more whose median length is 2 or more. A channel that rests now and then, and else changes at
+    every row, has mostly runs of one value and does not count; a constant has no run that ends.
 
     Args:
         columns: (rows,) its values in each episode, NaN = missing.
@@ -46,28 +46,28 @@ def find_held(columns: Sequence[Values]) -> Held | None:
     if _changes_mostly(columns):
         return None
     columns = [_known(column) for column in columns]
-    cells = sum(len(column) - 1 for column in columns if len(column))
+    pairs = sum(len(column) - 1 for column in columns if len(column))
     repeats = sum(int(np.count_nonzero(column[1:] == column[:-1])) for column in columns)
-    if not cells or repeats < HELD_SHARE * cells:
+    if not pairs or repeats < REPEATED_FRACTION * pairs:
         return None
     lengths: list[NDArray[np.int64]] = []
     for column in columns:
         if len(column):
             changes = np.flatnonzero(column[1:] != column[:-1]) + 1
-            lengths.append(np.diff(changes, prepend=0))  # without the last run, which is cut off
+            lengths.append(np.diff(changes, prepend=0))  # not the last run, which may go on
     runs = np.concatenate(lengths)
     if len(runs) < _FEWEST_RUNS:
         return None
     usual = int(np.median(runs))
-    return Held(repeats / cells, usual) if usual >= 2 else None
+    return Repeats(repeats / pairs, usual) if usual >= 2 else None
 
 
 def _changes_mostly(columns: Sequence[Values]) -> bool:
-    """Whether a part of the rows says already that too few of them can repeat the one before.
+    """Whether some of the rows show that too few of all can equal the one before.
 
-    Two rows in a row that are known and differ are a change, whatever is known elsewhere.
+    It is a fast test: two consecutive known values that differ are a change.
     """
-    enough = (1 - HELD_SHARE) * sum(len(column) - 1 for column in columns if len(column))
+    enough = (1 - REPEATED_FRACTION) * sum(len(column) - 1 for column in columns if len(column))
     changes = 0
     for column in columns:
         for start in range(0, len(column) - 1, _BLOCK):
@@ -84,15 +84,15 @@ def _known(column: Values) -> Values:
     return column[~missing] if missing.any() else column
 
 
-def measured_anew(column: Values, held: int) -> NDArray[np.bool_]:
-    """Where a held channel was measured: at each change, and every `held` rows while it rests.
+def new_values(column: Values, rows_per_value: int) -> NDArray[np.bool_]:
+    """Where a slower sensor gave a new value: at each change, and at its own rate while it rests.
 
     Args:
         column: (n,) NaN = missing.
-        held: rows per value.
+        rows_per_value: usual length of its runs of equal values.
 
     Returns:
-        (n,) True at known cells that are no repeats.
+        (n,) True at known values that are new.
     """
     at = np.flatnonzero(~np.isnan(column))
     fresh = np.zeros(len(column), dtype=bool)
@@ -101,12 +101,12 @@ def measured_anew(column: Values, held: int) -> NDArray[np.bool_]:
         new = np.append(True, known[1:] != known[:-1])
         starts = np.flatnonzero(new)
         since = np.arange(len(at)) - np.repeat(starts, np.diff(np.append(starts, len(at))))
-        fresh[at] = since % held == 0
+        fresh[at] = since % rows_per_value == 0
     return fresh
 
 
 def unwrap(column: Values, period: float) -> int:
-    """Takes jumps by more than half a turn out of an angle, in place; says how many there were."""
+    """Removes jumps by more than half a turn from an angle, in place; returns their number."""
     known = ~np.isnan(column)
     angles = column[known]
     if len(angles) < 2:
@@ -119,13 +119,13 @@ def unwrap(column: Values, period: float) -> int:
 
 
 @dataclass(frozen=True)
-class Mended:
+class QuaternionChanges:
     """What was done to the rows of a quaternion.
 
     Attributes:
-        flipped: rows whose sign follows the row before, and did not.
+        flipped: rows whose sign was changed to that of the row before.
         renormalised: rows whose length was off 1 by more than 0.001.
-        dropped: rows of length 0, or with some but not all of four cells, which are missing now.
+        dropped: rows of length 0, or with one to three of the four values missing; all are NaN now.
     """
 
     flipped: int
@@ -133,7 +133,7 @@ class Mended:
     dropped: int
 
 
-def mend_quaternion(four: Values) -> Mended:
+def make_continuous(four: Values) -> QuaternionChanges:
     """Makes a quaternion continuous in sign and of length 1, in place.
 
     Args:
@@ -147,7 +147,7 @@ def mend_quaternion(four: Values) -> Mended:
     turned = (unit[1:] * unit[:-1]).sum(axis=1) < 0
     sign = np.where(np.append(0, np.cumsum(turned)) % 2 == 1, -1.0, 1.0)[: len(unit)]
     four[whole] = unit * sign[:, None]
-    return Mended(
+    return QuaternionChanges(
         int((sign < 0).sum()),
         int((np.abs(norm[whole] - 1) > 1e-3).sum()),
         int((some & ~whole).sum()),
@@ -157,7 +157,7 @@ def mend_quaternion(four: Values) -> Mended:
 def find_quaternions(names: Sequence[str], columns: Iterable[Values]) -> list[int]:
     """First columns of four in a row that are a quaternion by their names and their length.
 
-    Names end in w, x, y, z or x, y, z, w after one stem that speaks of a rotation (`qx`, `q_w`,
+    Names end in w, x, y, z or x, y, z, w after one stem that names a rotation (`qx`, `q_w`,
     `orientation.z`); three rows in four, where all are known, have a length within 0.05 of 1.
 
     Args:

@@ -1,4 +1,4 @@
-"""From signals to episodes: clocks mended, streams merged on the union of stamps, outages cut."""
+"""From signals to episodes: rows ordered, signals merged on the union of stamps, outages cut."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning import anomalies
-from offbeat.data.cleaning import channels as repairs
-from offbeat.data.cleaning.options import CleaningLog, ReaderOptions
+from offbeat.data.cleaning.channels import find_quaternions
+from offbeat.data.cleaning.log import CleaningLog
+from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.trajectory import Trajectory
 from offbeat.errors import FileFormatError, InputError, one_of
@@ -32,8 +33,8 @@ class Channels:
     quaternions: tuple[tuple[int, ...], ...]
 
     @classmethod
-    def of(cls, recordings: list[Recording], policies: ReaderOptions) -> Channels:
-        """Collects the channels, and finds quaternions that no reader has marked.
+    def of(cls, recordings: list[Recording], options: ReaderOptions) -> Channels:
+        """Collects the channels, and finds quaternions that no reader marked.
 
         Raises:
             FileFormatError: there is no channel, names repeat, or units disagree.
@@ -65,7 +66,7 @@ class Channels:
             if len(signal.stamps) and signal.name not in looked_at:
                 looked_at.add(signal.name)
                 if "quaternion" not in signal.kinds:
-                    for first in repairs.find_quaternions(signal.channels, signal.values.T):
+                    for first in find_quaternions(signal.channels, signal.values.T):
                         for channel in signal.channels[first : first + 4]:
                             kinds[columns[signal.name, channel]] = "quaternion"
         several = len({signal for signal, _ in columns}) > 1
@@ -76,12 +77,12 @@ class Channels:
         if not names:
             raise FileFormatError("there is no channel to read, only times")
         for option, role in (("actions", "action"), ("exogenous", "exogenous")):
-            for name in getattr(policies, option):
+            for name in getattr(options, option):
                 roles[names.index(one_of(f"channel in {option}", name, names))] = role
-        for name in policies.angles:
+        for name in options.angles:
             kinds[names.index(one_of("channel in angles", name, names))] = "angle"
-        left_out = {one_of("channel in without", name, names) for name in policies.without}
-        chosen = tuple(name for name in policies.channels or names if name not in left_out)
+        left_out = {one_of("channel in without", name, names) for name in options.without}
+        chosen = tuple(name for name in options.channels or names if name not in left_out)
         if not chosen:
             raise InputError(f"there are no channels but those to be left out: {', '.join(names)}")
         kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
@@ -100,7 +101,7 @@ class Channels:
             tuple(
                 tuple(kept[at] for at in four)
                 for four in whole
-                if policies.quaternions == "continuous"
+                if options.quaternions == "continuous"
                 and all(at in kept and roles[at] != "action" for at in four)
             ),
         )
@@ -120,14 +121,14 @@ class Channels:
 
 @dataclass
 class Episode:
-    """A stretch of a recording, its signals merged."""
+    """A part of a recording, its signals merged."""
 
     stamps: NDArray[np.int64]
     values: NDArray[np.float64]
     owned: bool  # whether values may be written to
     recording: Recording = field(repr=False)
     part: str = ""
-    faults: dict[str, float] = field(default_factory=dict)  # found here, by what they are called
+    anomalies: dict[str, float] = field(default_factory=dict)  # number of each kind
 
     @property
     def label(self) -> str:
@@ -135,19 +136,18 @@ class Episode:
         return f"{self.recording.label}/{self.part}" if self.part else self.recording.label
 
     def own(self) -> NDArray[np.float64]:
-        """The values, copied first where they are not the episode's to write to."""
+        """The values, which can be written to; copied first where others use them."""
         if not self.owned:
             self.values, self.owned = self.values.copy(order="F"), True
         return self.values
 
-    def trajectory(self, channels: Channels, policies: ReaderOptions) -> Trajectory:
+    def trajectory(self, channels: Channels, options: ReaderOptions) -> Trajectory:
         """Seconds from integer nanoseconds, checked.
 
         Raises:
-            FileFormatError: a trajectory can't be made, for rows are less than float64 can tell
-                apart.
+            FileFormatError: a trajectory cannot be made: two times are equal in float64.
         """
-        zero = self.stamps[0] if policies.start == "first_row" else 0
+        zero = self.stamps[0] if options.start == "first_row" else 0
         part = f", part {self.part}" if self.part else ""
         origin = f"{self.recording.origin}{part}"
         try:
@@ -164,51 +164,53 @@ class Episode:
 
 
 def cut(
-    recording: Recording, channels: Channels, policies: ReaderOptions, account: CleaningLog
+    recording: Recording, channels: Channels, options: ReaderOptions, log: CleaningLog
 ) -> list[Episode]:
-    """The episodes of a recording: its clocks mended, its signals merged, split at outages."""
+    """The episodes of a recording: its rows in order, its signals merged, split at outages."""
     kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
     signals = [signal for signal in kept if signal is not None]
     if not signals:
-        account.empty += 1
+        log.empty += 1
         return []
     found: list[Episode] = []
     bare = replace(recording, signals=(), notes=())
-    for piece in _pieces(signals, recording, policies, account):
-        ordered = [_ordered(signal, recording, policies, account) for signal in piece]
+    for piece in _pieces(signals, recording, options, log):
+        ordered = [_ordered(signal, recording, options, log) for signal in piece]
         columns = [[channels.columns[s.name, c] for c in s.channels] for s in piece]
         stamps, values = anomalies.union(
             [(*o, c) for o, c in zip(ordered, columns, strict=True)], len(channels.names)
         )
         owned = values is not ordered[0][1] or values is not piece[0].values
         if any(np.isinf(column).any() for column in values.T):
-            values, owned = _without_infinite(values, owned, recording, channels, policies, account)
+            values, owned = _without_infinite(values, owned, recording, channels, options, log)
         disorders = [anomalies.disorder(signal.stamps) for signal in piece]
-        limit = anomalies.longest_allowed(stamps, policies.max_gap_s)
+        limit = anomalies.longest_allowed(stamps, options.max_gap_s)
         cuts = np.zeros(0, dtype=np.int64)
         if limit is not None:
-            account.limits_s.append(limit / 1e9)
+            log.limits_s.append(limit / 1e9)
             steps = np.diff(stamps)
             cuts = np.flatnonzero(steps > limit) + 1
-            account.outages_s += (steps[cuts - 1] / 1e9).tolist()
+            log.outages_s += (steps[cuts - 1] / 1e9).tolist()
         for start, end in zip([0, *cuts], [*cuts, len(stamps)], strict=True):
             episode = Episode(stamps[start:end], values[start:end], owned, bare)
-            episode.faults = _faults_in(episode.stamps, disorders)
+            episode.anomalies = _anomalies_in(episode.stamps, disorders)
             if start:
-                episode.faults["outage_before_s"] = float(stamps[start] - stamps[start - 1]) / 1e9
+                episode.anomalies["outage_before_s"] = (
+                    float(stamps[start] - stamps[start - 1]) / 1e9
+                )
             elif found:
-                episode.faults["clock_set_before"] = 1
+                episode.anomalies["clock_set_before"] = 1
             found.append(episode)
     if len(found) == 1:
         return found
-    long = [episode for episode in found if len(episode.stamps) >= policies.min_rows]
-    account.left_out += [len(e.stamps) for e in found if len(e.stamps) < policies.min_rows]
+    long = [episode for episode in found if len(episode.stamps) >= options.min_rows]
+    log.left_out += [len(e.stamps) for e in found if len(e.stamps) < options.min_rows]
     for k, episode in enumerate(long, 1):
         episode.part = str(k)
     return long
 
 
-def _faults_in(
+def _anomalies_in(
     stamps: NDArray[np.int64], disorders: Iterable[anomalies.Disorder]
 ) -> dict[str, float]:
     """How many rows between the first and the last stamp came late, or repeat one."""
@@ -222,15 +224,15 @@ def _faults_in(
 
 
 def _pieces(
-    signals: list[Signal], recording: Recording, policies: ReaderOptions, account: CleaningLog
+    signals: list[Signal], recording: Recording, options: ReaderOptions, log: CleaningLog
 ) -> list[list[Signal]]:
-    """Signals cut where the clock was set, each piece with the stretches that belong together."""
+    """Signals cut where the clock was set, each piece with the parts that belong together."""
     cuts = [anomalies.clock_jumps(signal.stamps) for signal in signals]
     most = max(range(len(signals)), key=lambda i: len(cuts[i]))
-    account.clock_jumps += len(cuts[most])
-    if not len(cuts[most]) or policies.clock_jumps == "join":
+    log.clock_jumps += len(cuts[most])
+    if not len(cuts[most]) or options.clock_jumps == "join":
         return [signals]
-    if policies.clock_jumps == "refuse":
+    if options.clock_jumps == "refuse":
         row, stamps = int(cuts[most][0]), signals[most].stamps
         raise FileFormatError(
             f"{_where(signals[most], recording)}the clock was set from {_seconds(stamps[row - 1])} "
@@ -241,7 +243,7 @@ def _pieces(
     for signal, cut in zip(signals, cuts, strict=True):
         bounds = [0, *cut.tolist(), len(signal.stamps)]
         for k, (start, end) in enumerate(itertools.pairwise(bounds)):
-            stretch = Signal(
+            part = Signal(
                 signal.name,
                 signal.stamps[start:end],
                 signal.values[start:end],
@@ -249,25 +251,25 @@ def _pieces(
                 signal.units,
                 signal.kinds,
             )
-            low, high = stretch.stamps.min(), stretch.stamps.max()
+            low, high = part.stamps.min(), part.stamps.max()
             shared = [min(high, top) - max(low, bottom) for bottom, top in spans]
             at = k if len(cut) == len(cuts[most]) else int(np.argmax(shared))
-            pieces[at].append(stretch)
+            pieces[at].append(part)
     return pieces
 
 
 def _ordered(
-    signal: Signal, recording: Recording, policies: ReaderOptions, account: CleaningLog
+    signal: Signal, recording: Recording, options: ReaderOptions, log: CleaningLog
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     found = anomalies.disorder(signal.stamps)
     if not found.any:
         return signal.stamps, signal.values
-    refused = (len(found.late) and policies.order == "refuse") or (
-        len(found.duplicates) and policies.duplicates == "refuse"
+    refused = (len(found.late) and options.order == "refuse") or (
+        len(found.duplicates) and options.duplicates == "refuse"
     )
     if refused:
         stamps = signal.stamps
-        if policies.order != "refuse":
+        if options.order != "refuse":
             stamps = np.sort(stamps)
         row = int(np.argmax(np.diff(stamps) <= 0)) + 1
         raise FileFormatError(
@@ -277,12 +279,12 @@ def _ordered(
         )
     name = signal.name or (signal.channels[0] if len(signal.channels) == 1 else "rows")
     if len(found.late):
-        account.late[name] += len(found.late)
-    stamps, values = anomalies.in_order(signal.stamps, signal.values, policies.order)
+        log.late[name] += len(found.late)
+    stamps, values = anomalies.in_order(signal.stamps, signal.values, options.order)
     before = len(stamps)
-    stamps, values = anomalies.one_row_per_stamp(stamps, values, policies.duplicates)
+    stamps, values = anomalies.one_row_per_stamp(stamps, values, options.duplicates)
     if before > len(stamps):
-        account.duplicates[name] += before - len(stamps)
+        log.duplicates[name] += before - len(stamps)
     return stamps, values
 
 
@@ -291,17 +293,17 @@ def _without_infinite(
     owned: bool,
     recording: Recording,
     channels: Channels,
-    policies: ReaderOptions,
-    account: CleaningLog,
+    options: ReaderOptions,
+    log: CleaningLog,
 ) -> tuple[NDArray[np.float64], bool]:
     infinite = np.isinf(values)
-    if policies.infinite == "refuse":
+    if options.infinite == "refuse":
         row, channel = np.argwhere(infinite)[0]
         raise FileFormatError(
             f"{recording.origin}: values are infinite at row {row}, channel "
-            f"{channels.names[channel]!r}; infinite=missing takes such cells as missing"
+            f"{channels.names[channel]!r}; infinite=missing counts such values as missing"
         )
-    account.infinite += int(infinite.sum())
+    log.infinite += int(infinite.sum())
     values = values if owned else values.copy(order="F")
     values[infinite] = np.nan
     return values, True

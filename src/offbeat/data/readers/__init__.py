@@ -1,16 +1,13 @@
-"""Readers: one function for every file format, chosen by the file's suffix and content.
+"""Readers of file formats, chosen by a file's suffix and content.
 
-A new format is one small module with a function `(path, **options) -> Iterable[Recording]` and one
-`register`, or, in a package of its own, an entry point of the group `offbeat.readers`.
+A new format is a function `(path, *, options) -> Iterable[Recording]` and one call of
+`register_reader`, or an entry point of the group `offbeat.readers`, whose name is the format's.
 """
 
 from __future__ import annotations
 
-import functools
-import importlib.metadata
 import inspect
 import logging
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -22,15 +19,13 @@ from offbeat.data.recording import ReaderOptions, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
-
-ENTRY_POINTS = "offbeat.readers"
-"""The group in which other packages name a `Reader` of theirs, or a function that makes one."""
+from offbeat.registry import Registry
 
 FOLDER = "/"
-"""Stands among the suffixes of a reader that reads folders; it must have `recognises`."""
+"""Stands among the suffixes of a reader of folders; such a reader must have `recognises`."""
 
-POLICIES = tuple(field.name for field in fields(ReaderOptions))
-"""The options that every format has."""
+OPTIONS = tuple(field.name for field in fields(ReaderOptions))
+"""The options that every format has whose reader gives recordings."""
 
 
 @dataclass(frozen=True)
@@ -38,55 +33,78 @@ class Reader:
     """A file format that can be read.
 
     Args:
-        name: the name users give, when they name the format at all.
+        name: of the format.
         suffixes: file name suffixes, in lower case, each with its dot; `FOLDER` for folders.
         function: reads a file, whose path is its one positional argument; its keyword arguments
-            are the options of the format. It gives recordings, to which `read` applies the
-            policies, or a data set, to which it applies none. It opens no file that
-            `require_file` has not passed (`read` calls that for the file itself).
+            are the options of the format. It gives recordings, which are cleaned as `ReaderOptions`
+            say, or a finished data set. It opens no file that `require_file` has not passed (`read`
+            calls that for the file itself).
         recognises: looks into a file (or a folder, where `FOLDER` is among the suffixes) and says
-            whether it is of this format, for formats that share a suffix with another one; it
-            never raises. None where the suffix is enough; such a reader gets what no other one
-            recognises.
-        policies: whether `function` gives recordings.
+            whether it is of this format, for formats that share a suffix; it never raises. None
+            where the suffix is enough; such a reader gets what no other one recognises.
+        cleaning: whether `function` gives recordings.
+
+    Raises:
+        InputError: a suffix is not lower case with a dot, or a reader of folders has no
+            `recognises`.
     """
 
     name: str
     suffixes: tuple[str, ...]
     function: Callable[..., Iterable[Recording] | Dataset]
     recognises: Callable[[Path], bool] | None = None
-    policies: bool = True
+    cleaning: bool = True
+
+    def __post_init__(self) -> None:
+        for suffix in self.suffixes:
+            if suffix != FOLDER and (suffix != suffix.lower() or not suffix.startswith(".")):
+                raise InputError(
+                    f"suffixes of reader {self.name!r} must be lower case with a dot, such as "
+                    f"'.csv', or {FOLDER!r} for folders, got {suffix!r}"
+                )
+        if FOLDER in self.suffixes and self.recognises is None:
+            raise InputError(f"reader {self.name!r} reads folders, so it needs recognises")
 
     @property
-    def options(self) -> list[str]:
-        """Names of the options that the format has, beside the policies."""
+    def own_options(self) -> list[str]:
+        """Names of the options of the format alone."""
         parameters = inspect.signature(self.function).parameters.values()
         return [p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY]
 
+    @property
+    def options(self) -> list[str]:
+        """Names of all options: those of the format, and `ReaderOptions` where they apply."""
+        return list(dict.fromkeys([*self.own_options, *(OPTIONS if self.cleaning else ())]))
 
-READERS: dict[str, Reader] = {}
-"""The formats that can be read, by name; added to with `register`."""
+
+READERS: Registry[Reader] = Registry("format", group="offbeat.readers")
+"""The formats that can be read."""
 
 
-def register(reader: Reader) -> Reader:
-    """Adds a format; `read` then finds it by its suffixes.
+def register_reader(
+    name: str,
+    function: Callable[..., Iterable[Recording] | Dataset],
+    *,
+    suffixes: Iterable[str],
+    recognises: Callable[[Path], bool] | None = None,
+    cleaning: bool = True,
+    replace: bool = False,
+) -> Reader:
+    """Adds a format to those that `read` reads.
+
+    Args:
+        name: of the format.
+        function: as of `Reader`.
+        suffixes: as of `Reader`.
+        recognises: as of `Reader`.
+        cleaning: as of `Reader`.
+        replace: allow a name that is taken.
 
     Raises:
-        InputError: the name is taken, a suffix is not lower case with a dot, or a reader of
-            folders has no `recognises`.
+        InputError: the name is taken, or as of `Reader`.
     """
-    if reader.name in READERS:
-        raise InputError(f"there is a reader {reader.name!r} already; choose another name")
-    for suffix in reader.suffixes:
-        if suffix != FOLDER and (suffix != suffix.lower() or not suffix.startswith(".")):
-            raise InputError(
-                f"suffixes of reader {reader.name!r} must be lower case with a dot, such as "
-                f"'.csv', or {FOLDER!r} for folders, got {suffix!r}"
-            )
-    if FOLDER in reader.suffixes and reader.recognises is None:
-        raise InputError(f"reader {reader.name!r} reads folders, and needs recognises to know them")
-    READERS[reader.name] = reader
-    return reader
+    reader = Reader(name, tuple(suffixes), function, recognises, cleaning)
+    return READERS.register(name, reader, replace=replace)
 
 
 def read(path: str | Path, *, format: str | None = None, **options: Any) -> Dataset:
@@ -99,46 +117,49 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
             `ReaderOptions`, which every format has but our own.
 
     Returns:
-        The data set. Its `meta["report"]` says what the policies did, `meta["source"]` where it
-        came from. What a reader had to assume (a unit of time found by the numbers, say) stands in
-        `meta["report"]["notes"]`, and is logged as a warning of the logger `offbeat`.
+        The data set. Its `meta["cleaning"]` says what was found and done, `meta["source"]` where it
+        came from. What a reader had to assume, such as a unit of time found by the numbers, is in
+        `meta["cleaning"]["notes"]`, and is logged as a warning of the logger `offbeat`.
 
     Raises:
         FileFormatError: the file is missing, of no known format, or not what its format asks for.
         InputError: the format or an option is unknown.
     """
     path = require_source(path)
-    load_entry_points()
-    reader = reader_of(path) if format is None else READERS[one_of("format", format, READERS)]
-    own, known = reader.options, options_of(reader)
-    if isinstance(options.get("actions"), bool) and "include_actions" in own:
-        options["include_actions"] = options.pop("actions")  # as Offbeat 0.1.0 called it
+    reader = reader_of(path) if format is None else READERS[format]
+    options = _renamed(options, reader)
     for option in options:
-        if not known:
+        if not reader.options:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
-        one_of(f"option of the {reader.name} reader", option, known)
-    policies = {name: options.pop(name) for name in list(options) if name not in own}
-    made = reader.function(path, **options)
+        one_of(f"option of the {reader.name} reader", option, reader.options)
+    own = {name: options.pop(name) for name in reader.own_options if name in options}
+    made = reader.function(path, **own)
     if isinstance(made, Dataset):
-        if policies:
+        if options:
             raise InputError(
-                f"the {reader.name} reader gives a finished data set, to which policies no longer "
-                f"apply, got {', '.join(policies)}"
+                f"the {reader.name} reader gives a finished data set, which is not cleaned again, "
+                f"got the options {', '.join(options)}"
             )
         return made
-    dataset = assemble(made, ReaderOptions(**policies))
-    for note in dataset.meta["report"]["notes"]:
+    dataset = assemble(made, ReaderOptions(**options))
+    for note in dataset.meta["cleaning"]["notes"]:
         logging.getLogger("offbeat").warning("%s: %s", path, note)
     return replace(dataset, meta={"source": path.name, "format": reader.name, **dataset.meta})
 
 
-def options_of(reader: Reader) -> list[str]:
-    """All options of a format: its own, and the policies where they apply."""
-    return list(dict.fromkeys([*reader.options, *(POLICIES if reader.policies else ())]))
+def _renamed(options: dict[str, Any], reader: Reader) -> dict[str, Any]:
+    """Options in the names of this version, from those that runs of Offbeat 0.1.0 have saved."""
+    options = dict(options)
+    if "held" in options and "repeated" in reader.options:
+        options.setdefault("repeated", options["held"])
+        del options["held"]
+    if isinstance(options.get("actions"), bool) and "include_actions" in reader.options:
+        options["include_actions"] = options.pop("actions")
+    return options
 
 
 def reader_of(path: Path) -> Reader:
-    """The reader of a file or folder that is there, by its suffix and content.
+    """The reader of a file or folder that exists, by its suffix and content.
 
     Raises:
         FileFormatError: no reader is for it.
@@ -162,35 +183,30 @@ def reader_of(path: Path) -> Reader:
             f"{path} has the unknown suffix {suffix!r}, expected one of: {', '.join(named)}; "
             "rename it, or name its format with format="
         )
-    # Nobody's file: a reader of that suffix says best what is wrong with it.
+    # No reader recognises it: one that goes by the suffix alone gives the best message.
     return next((reader for reader in fitting if reader.recognises is None), fitting[0])
 
 
-@functools.cache
-def load_entry_points() -> None:
-    """Registers the readers of other packages, once.
-
-    One that can't be loaded costs a warning: it must not keep the others from reading.
-    """
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        try:
-            loaded = entry.load()
-            register(loaded if isinstance(loaded, Reader) else loaded())
-        except Exception as error:
-            warnings.warn(
-                f"the reader {entry.name!r} ({entry.value}) of another package can't be used: "
-                f"{type(error).__name__}: {error}",
-                stacklevel=2,
-            )
-
-
-register(Reader("offbeat", (".parquet",), store.load, store.holds_data_set, policies=False))
-register(Reader("parquet", (".parquet", ".pq"), parquet.read_parquet))
-register(Reader("euroc", (".csv", FOLDER), pose.read_euroc, pose.is_euroc))
-register(Reader("tum", (".tum", ".txt"), pose.read_tum, pose.is_tum))
-register(Reader("csv", (".csv", ".tsv", ".txt"), table.read_csv))
-register(Reader("npz", (".npz",), npz.read_npz))
-register(Reader("lerobot", (".parquet", ".json", FOLDER), lerobot.recordings, lerobot.recognises))
-register(Reader("ros", (*ros.SUFFIXES, FOLDER), ros.recordings, ros.recognises))
-register(Reader("ulog", ulog.SUFFIXES, ulog.recordings))
-register(Reader("hdf5", (*hdf5.SUFFIXES, FOLDER), hdf5.recordings, hdf5.recognises))
+register_reader(
+    "offbeat",
+    store.load,
+    suffixes=(".parquet",),
+    recognises=store.holds_data_set,
+    cleaning=False,
+)
+register_reader("parquet", parquet.read_parquet, suffixes=(".parquet", ".pq"))
+register_reader("euroc", pose.read_euroc, suffixes=(".csv", FOLDER), recognises=pose.is_euroc)
+register_reader("tum", pose.read_tum, suffixes=(".tum", ".txt"), recognises=pose.is_tum)
+register_reader("csv", table.read_csv, suffixes=(".csv", ".tsv", ".txt"))
+register_reader("npz", npz.read_npz, suffixes=(".npz",))
+register_reader(
+    "lerobot",
+    lerobot.recordings,
+    suffixes=(".parquet", ".json", FOLDER),
+    recognises=lerobot.recognises,
+)
+register_reader("ros", ros.recordings, suffixes=(*ros.SUFFIXES, FOLDER), recognises=ros.recognises)
+register_reader("ulog", ulog.recordings, suffixes=ulog.SUFFIXES)
+register_reader(
+    "hdf5", hdf5.recordings, suffixes=(*hdf5.SUFFIXES, FOLDER), recognises=hdf5.recognises
+)

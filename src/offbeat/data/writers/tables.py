@@ -1,7 +1,4 @@
-"""Tables for other programs: columns of equal length, written as CSV or plain Parquet.
-
-Data sets that Offbeat reads back are written by `offbeat.data.store`.
-"""
+"""Tables for other programs, as CSV or plain Parquet."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
 from offbeat.files import atomic_path
 
@@ -20,18 +18,18 @@ from offbeat.files import atomic_path
 def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     """Writes columns as CSV or Parquet, by the suffix of `path`; whole or not at all.
 
-    Floats are written to the last bit; in CSV a NaN is an empty cell.
+    Floats are written to the last bit; in CSV a NaN is an empty field.
 
     Args:
-        path: the file, `.csv` or `.parquet`; what stood there is replaced.
+        path: the file, `.csv`, `.parquet` or `.pq`; an existing one is replaced.
         columns: (rows,) numbers, booleans or strings, by name.
 
     Raises:
         InputError: the suffix is unknown, or columns differ in length or are of another kind.
-        OSError: the file can't be written.
+        OSError: the file cannot be written.
     """
     path = Path(path)
-    suffix = one_of("suffix of a table", path.suffix.lower(), (".csv", ".parquet"))
+    suffix = one_of("suffix of a table", path.suffix.lower(), (".csv", ".parquet", ".pq"))
     arrays = {name: np.asarray(column) for name, column in columns.items()}
     shapes = {array.shape for array in arrays.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
@@ -50,6 +48,37 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
             import pyarrow.parquet as pq
 
             pq.write_table(pa.table(arrays), temporary, compression="zstd")
+
+
+def write_dataset(dataset: Dataset, path: str | Path) -> None:
+    """Writes a data set as a table: a row per time, columns `trajectory`, `time`, and channels.
+
+    `trajectory` is the label of the trajectory where it has one, else its number. A channel's unit
+    stands in brackets after its name.
+
+    Args:
+        dataset: the data set.
+        path: as of `write_table`.
+
+    Raises:
+        InputError: as of `write_table`, or a channel has the name of another column.
+    """
+    named = [
+        f"{name} [{unit}]" if unit else name
+        for name, unit in zip(dataset.names, dataset.units, strict=True)
+    ]
+    for i, name in enumerate(named):
+        if name in ("trajectory", "time", *named[:i]):
+            raise InputError(f"two columns would have the name {name!r}; rename the channel")
+    labels = dataset.meta.get("labels", ())
+    if len(labels) != len(dataset) or len(set(labels)) < len(labels):
+        labels = range(len(dataset))
+    values = np.concatenate([t.values for t in dataset])
+    columns: dict[str, NDArray[Any]] = {
+        "trajectory": np.repeat(np.asarray(labels), [t.rows for t in dataset]),
+        "time": np.concatenate([t.times for t in dataset]),
+    }
+    write_table(path, columns | {name: values[:, c] for c, name in enumerate(named)})
 
 
 def _write_csv(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -1,0 +1,197 @@
+"""The log of what was found and done while recordings were cleaned."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from offbeat.data.cleaning.options import ReaderOptions
+
+
+@dataclass
+class CleaningLog:
+    """Counts what is found and done while a data set is assembled.
+
+    Attributes:
+        late: rows out of order, by signal.
+        duplicates: rows with the time stamp of another row, by signal.
+        clock_jumps: times at which a clock was set.
+        limits_s: s, the shortest outage, one entry per recording.
+        outages_s: s, the outages that split.
+        left_out: rows of each episode that was too short.
+        empty: recordings without a row.
+        infinite: infinite values.
+        repeated: of each channel with repeated values, their fraction and the rows per value.
+        masked: repeated values that no longer count as measured.
+        turns: jumps by a turn that were removed from each angle.
+        angles: of each channel that was unwrapped, its period and the range it was recorded in.
+        quaternions: channels of each quaternion.
+        flipped: rows of quaternions whose sign was changed.
+        renormalised: rows of quaternions whose length was off 1 by more than 0.001.
+        dropped: rows of quaternions that were none.
+        notes: what readers had to assume or to leave out.
+    """
+
+    late: Counter[str] = field(default_factory=Counter)
+    duplicates: Counter[str] = field(default_factory=Counter)
+    clock_jumps: int = 0
+    limits_s: list[float] = field(default_factory=list)
+    outages_s: list[float] = field(default_factory=list)
+    left_out: list[int] = field(default_factory=list)
+    empty: int = 0
+    infinite: int = 0
+    repeated: dict[str, dict[str, float]] = field(default_factory=dict)
+    masked: int = 0
+    turns: Counter[str] = field(default_factory=Counter)
+    angles: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    quaternions: list[list[str]] = field(default_factory=list)
+    flipped: int = 0
+    renormalised: int = 0
+    dropped: int = 0
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def to_dict(self, options: ReaderOptions, episodes: list[dict[str, float]]) -> dict[str, Any]:
+        """Option and finding of each kind of anomaly, JSON-like.
+
+        Args:
+            options: that were applied.
+            episodes: of the trajectories with anomalies, the number and what was found there.
+        """
+        o = options
+        limits = [min(self.limits_s), max(self.limits_s)] if self.limits_s else None
+        return {
+            "order": {"option": o.order, "late": self.late.total(), "signals": dict(self.late)},
+            "duplicates": {
+                "option": o.duplicates,
+                "rows": self.duplicates.total(),
+                "signals": dict(self.duplicates),
+            },
+            "clock_jumps": {"option": o.clock_jumps, "found": self.clock_jumps},
+            "outages": {
+                "max_gap_s": o.max_gap_s,
+                "limits_s": limits,
+                "found": len(self.outages_s),
+                "longest_s": max(self.outages_s, default=None),
+            },
+            "left_out": {
+                "min_rows": o.min_rows,
+                "episodes": len(self.left_out),
+                "rows": sum(self.left_out),
+                "without_rows": self.empty,
+            },
+            "infinite": {"option": o.infinite, "values": self.infinite},
+            "repeated": {"option": o.repeated, "channels": self.repeated, "masked": self.masked},
+            "angles": {
+                "unwrap": o.unwrap,
+                "turns": dict(self.turns),
+                "channels": self.angles,
+            },
+            "quaternions": {
+                "option": o.quaternions,
+                "channels": self.quaternions,
+                "flipped": self.flipped,
+                "renormalised": self.renormalised,
+                "dropped": self.dropped,
+            },
+            "resample_hz": o.resample_hz,
+            "episodes": episodes,
+            "notes": list(self.notes),
+        }
+
+
+def upgraded(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The cleaning log of a data set that Offbeat 0.1.0 stored, in the terms of this version."""
+    log = {
+        key: {"option" if k == "policy" else k: v for k, v in entry.items()}
+        if isinstance(entry, Mapping)
+        else entry
+        for key, entry in report.items()
+    }
+    repeated = dict(log.pop("held"))
+    repeated["channels"] = {
+        name: {"fraction": found["share"], "rows_per_value": found["rows_per_value"]}
+        for name, found in repeated["channels"].items()
+    }
+    infinite = dict(log["infinite"])
+    infinite["values"] = infinite.pop("cells")
+    return {**log, "repeated": repeated, "infinite": infinite}
+
+
+def sentences(cleaning: Mapping[str, Any]) -> list[str]:
+    """A cleaning log as sentences, one for each kind of anomaly that was found."""
+    said: list[str] = list(cleaning["notes"])
+    order, duplicates, jumps = cleaning["order"], cleaning["duplicates"], cleaning["clock_jumps"]
+    if order["late"]:
+        what = {"sort": "sorted", "drop": "dropped"}.get(order["option"], order["option"])
+        said.append(f"{_rows(order['late'])} came late and {_were(order['late'])} {what}")
+    if duplicates["rows"]:
+        how = {"mean": "the mean of the known values"}.get(
+            duplicates["option"], f"the {duplicates['option']} known value"
+        )
+        said.append(
+            f"{_rows(duplicates['rows'])} had the time stamp of another row; {how} of each channel "
+            "was kept"
+        )
+    if jumps["found"]:
+        what = {"split": "each began a new episode"}.get(jumps["option"], "they were ignored")
+        said.append(f"the clock was set {jumps['found']} times; {what}")
+    outages = cleaning["outages"]
+    if outages["found"]:
+        count, longest = outages["found"], f"{outages['longest_s']:.3g} s"
+        what = f"{count} outages, the longest of {longest}, each" if count > 1 else ""
+        said.append(
+            f"{what or f'1 outage of {longest}'} began a new episode "
+            f"(max_gap_s {outages['max_gap_s']})"
+        )
+    left = cleaning["left_out"]
+    if left["episodes"]:
+        said.append(
+            f"{left['episodes']} episodes of fewer than {left['min_rows']} rows were left out "
+            f"({_rows(left['rows'])})"
+        )
+    if left["without_rows"]:
+        said.append(f"{left['without_rows']} recordings without a row were left out")
+    if cleaning["infinite"]["values"]:
+        said.append(f"{cleaning['infinite']['values']} infinite values count as missing")
+    repeated = cleaning["repeated"]
+    if repeated["channels"]:
+        done = (
+            f"{repeated['masked']} of them were masked"
+            if repeated["option"] == "mask"
+            else "they were kept (repeated=mask masks them)"
+        )
+        said.append(
+            f"repeated values, of a sensor slower than the log, in "
+            f"{listed(list(repeated['channels']))}; {done}"
+        )
+    turns = cleaning["angles"]["turns"]
+    if turns:
+        said.append(
+            f"{sum(turns.values())} jumps by a turn were removed from {listed(list(turns))}"
+        )
+    quaternions = cleaning["quaternions"]
+    if any(quaternions[kind] for kind in ("flipped", "renormalised", "dropped")):
+        said.append(
+            f"quaternions {listed(['/'.join(four) for four in quaternions['channels']])}: "
+            f"{quaternions['flipped']} rows changed sign, {quaternions['renormalised']} had "
+            f"another length than 1, {quaternions['dropped']} were none and are missing"
+        )
+    if cleaning["resample_hz"] is not None:
+        said.append(f"resampled at {cleaning['resample_hz']:g} Hz")
+    return said
+
+
+def _rows(count: int) -> str:
+    return "1 row" if count == 1 else f"{count} rows"
+
+
+def _were(count: int) -> str:
+    return "was" if count == 1 else "were"
+
+
+def listed(names: list[str], most: int = 6) -> str:
+    """Names for messages; of many, the first ones and the number of the others."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
