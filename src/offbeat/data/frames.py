@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from offbeat.data.arrays import owned
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.errors import InputError, one_of, require
+from offbeat.errors import InputError, MissingExtraError, one_of
 
 
 def to_pandas(dataset: Dataset) -> Any:
@@ -28,12 +29,12 @@ def to_pandas(dataset: Dataset) -> Any:
         InputError: a channel is called `trajectory` or `time`.
         MissingExtraError: pandas is not installed.
     """
-    pd = require("pandas", "pandas")
+    pandas = _pandas()
     for name in ("trajectory", "time"):
         if name in dataset.names:
             raise InputError(f"a channel is called {name!r}, as a column of the frame; rename it")
     values = np.concatenate([np.where(t.observed, t.values, np.nan) for t in dataset])
-    frame = pd.DataFrame(values, columns=list(dataset.names))
+    frame = pandas.DataFrame(values, columns=list(dataset.names))
     frame.insert(0, "time", np.concatenate([t.times for t in dataset]))
     frame.insert(0, "trajectory", np.repeat(np.arange(len(dataset)), [t.rows for t in dataset]))
     frame.attrs["units"] = dict(zip(dataset.names, dataset.units, strict=True))
@@ -69,7 +70,7 @@ def from_pandas(
             within a trajectory.
         MissingExtraError: pandas is not installed.
     """
-    require("pandas", "pandas")
+    _pandas()
     columns = list(frame.columns)
     one_of("column of times", time, columns)
     if by is None and "trajectory" in columns and time != "trajectory":
@@ -105,6 +106,16 @@ def from_pandas(
             for index in rows
         )
     )
+
+
+def _pandas() -> Any:
+    try:
+        return importlib.import_module("pandas")
+    except ImportError as error:
+        raise MissingExtraError(
+            f"this needs pandas, which is not installed ({error}); install it with: "
+            "pip install pandas"
+        ) from None
 
 
 def _clock(column: Any, name: str) -> tuple[Any, bool]:
