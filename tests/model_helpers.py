@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,10 +87,16 @@ def with_growing_decays(model: Model) -> Model:
     return model
 
 
+def rows_of(batch: Batch, start: int, stop: int) -> Batch:
+    """The rows from `start` up to, not including, `stop`, times unchanged."""
+    names = ("times", "values", "mask", "known", "valid")
+    return replace(batch, **{name: getattr(batch, name)[:, start:stop] for name in names})
+
+
 def predictions(model: Model, batch: Batch, **options: Any) -> Tensor:
     """(batch, rows, channels) without a graph, 0 at padding."""
     with torch.no_grad():
-        return model(batch, **options).predictions * batch.valid[..., None]
+        return model(batch, **options).mean * batch.valid[..., None]
 
 
 def error(got: Tensor, expected: Tensor) -> float:

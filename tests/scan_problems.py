@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -10,11 +11,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from offbeat.kernels import ScanSpec, ScanWeights, StepInputs
+from offbeat.kernels import ScanParts, ScanSpec, StepInputs
+from offbeat.kernels.reference import perceptron
+from offbeat.parts import CELLS as KINDS
 
 CELLS: dict[str, dict[str, Any]] = {
     "none": {"cell": "none"},
-    "set": {"cell": "set"},
+    "start": {"cell": "start"},
     "elman": {"cell": "elman"},
     "lstm": {"cell": "lstm"},
     "gru": {"cell": "gru"},
@@ -36,7 +39,7 @@ class Problem(NamedTuple):
     """A scan, and what its results are multiplied by to make a loss."""
 
     spec: ScanSpec
-    weights: ScanWeights
+    weights: ScanParts
     rows: StepInputs
     state: Tensor
     factors: tuple[Tensor, Tensor]
@@ -52,30 +55,44 @@ class Problem(NamedTuple):
             )
 
         tensors = [t.detach().double().requires_grad_() for t in self.weights.tensors()]
-        facts = {f.name: cast(getattr(self.rows, f.name)) for f in fields(self.rows)}
+        inputs = {f.name: cast(getattr(self.rows, f.name)) for f in fields(self.rows)}
         return self._replace(
             weights=self.with_weights(tensors),
-            rows=StepInputs(**facts),
+            rows=StepInputs(**inputs),
             state=self.state.detach().double().requires_grad_(),
             factors=(self.factors[0].double(), self.factors[1].double()),
         )
 
-    def with_weights(self, tensors: Sequence[Tensor]) -> ScanWeights:
-        """The weights with other tensors, in the order of `ScanWeights.tensors`."""
+    def with_weights(self, tensors: Sequence[Tensor]) -> ScanParts:
+        """The parts with other tensors, in the order of `ScanParts.tensors`."""
         left = list(tensors)
-
-        def take(old: Tensor | None) -> Tensor | None:
-            return None if old is None else left.pop(0)
 
         def pairs(old: Any) -> Any:
             return tuple((left.pop(0), left.pop(0)) for _ in old)
 
         old = self.weights
-        names = ("inputs", "bias", "recurrent", "recurrent_bias", "innovation")
-        taken: dict[str, Any] = {name: take(getattr(old, name)) for name in names}
-        for name in ("decay", "input_decay"):
-            taken[name] = None if getattr(old, name) is None else pairs([0])[0]
-        return ScanWeights(**taken, field=pairs(old.field), decoder=pairs(old.decoder))
+        cell: Any = copy.copy(old.cell)
+        if cell is not None:
+            cell._parameters = {}
+            for name in ("inputs", "bias", "recurrent", "recurrent_bias", "innovation"):
+                value = getattr(old.cell, name)
+                object.__setattr__(cell, name, None if value is None else left.pop(0))
+        decay = None if old.decay is None else pairs([0])[0]
+        input_decay = None if old.input_decay is None else pairs([0])[0]
+        field: Any = None
+        if old.field is not None:
+            field = Layered(pairs(old.field.layers), old.field.activation)  # type: ignore[attr-defined]
+        return ScanParts(cell, decay, input_decay, field, pairs(old.decoder))
+
+
+class Layered:
+    """A perceptron of plain tensors."""
+
+    def __init__(self, layers: Any, activation: str) -> None:
+        self.layers, self.activation = layers, activation
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return perceptron(self.layers, x, self.activation)
 
 
 def problem(
@@ -106,11 +123,15 @@ def problem(
     if cell == "none" and flow == "none" and not features:
         features = 1  # a scan of nothing at all has no weights
     has_cell = cell != "none"
+    kind = KINDS[CELLS[cell]["cell"]] if has_cell else None
+    gates = kind.gates_per_unit * hidden if kind else 0
     spec = ScanSpec(
         channels=channels,
         hidden_size=hidden,
+        gates=gates,
+        memory=kind.memory_per_unit * hidden if kind else 0,
         anchored=anchored,
-        ages=ages if has_cell else 0,
+        time_inputs=ages if has_cell else 0,
         field=() if FLOWS[flow] is None else (driven, *units, driven),
         activation=activation,  # type: ignore[arg-type]
         decay=features,
@@ -132,16 +153,22 @@ def problem(
     def layers(sizes: tuple[int, ...]) -> tuple[tuple[Tensor, Tensor], ...]:
         return tuple((weight(o, i), weight(o)) for i, o in itertools.pairwise(sizes))
 
-    gates = spec.gates
-    weights = ScanWeights(
-        inputs=weight(gates, 2 * channels + ages) if has_cell else None,
-        bias=weight(gates) if has_cell else None,
-        recurrent=weight(gates, hidden) if spec.cell not in ("none", "set") else None,
-        recurrent_bias=weight(hidden) if spec.reset_after else None,
-        innovation=weight(gates, channels) if anchored and has_cell else None,
+    part: Any = None
+    if kind is not None:
+        part = kind(
+            2 * channels + ages,
+            hidden,
+            innovation=channels if anchored else 0,
+            reset_after=spec.reset_after,
+        ).to(dtype)
+        with torch.no_grad():
+            for tensor in part.tensors():
+                tensor.copy_(normal(*tensor.shape))
+    parts = ScanParts(
+        cell=part,
         decay=(weight(hidden, features), weight(hidden)) if features else None,
         input_decay=(weight(channels), weight(channels)) if input_decay else None,
-        field=layers(spec.field),
+        field=Layered(layers(spec.field), activation) if spec.field else None,  # type: ignore[arg-type]
         decoder=layers(spec.decoder),
     )
     mask = (uniform(batch, rows, channels) < 0.6) & (uniform(batch, rows, 1) < 0.7)
@@ -153,12 +180,12 @@ def problem(
     length = None
     if padded:
         length = torch.randint(1, rows + 1, (batch,), generator=generator)
-    facts = StepInputs(
+    given = StepInputs(
         gap=gap,
         update=update,
         values=normal(batch, rows, channels, by=1.0) * mask,
         mask=mask,
-        age=uniform(batch, rows, ages) if ages and has_cell else None,
+        time_input=uniform(batch, rows, ages) if ages and has_cell else None,
         updated=torch.cat([torch.zeros(batch, 1, dtype=dtype), update[:, :-1]], dim=1)
         if features
         else None,
@@ -172,7 +199,7 @@ def problem(
     )
     state = normal(batch, spec.state_size).requires_grad_()
     factors = tuple(normal(batch, rows, spec.state_size, by=1.0) for _ in range(2))
-    return Problem(spec, weights, facts, state, factors)  # type: ignore[arg-type]
+    return Problem(spec, parts, given, state, factors)  # type: ignore[arg-type]
 
 
 def run(scan: Callable[..., tuple[Tensor, Tensor]], case: Problem) -> dict[str, Tensor]:

@@ -89,5 +89,5 @@ def batch_predictions(model: Model, one: Trajectory) -> Any:
     import torch
 
     with torch.no_grad():
-        scaled = model(model.batch(Dataset((one,)))).predictions[0]
+        scaled = model(model.batch(Dataset((one,)))).mean[0]
     return model.scaler.original(scaled.double().numpy())

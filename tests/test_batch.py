@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from model_helpers import TICK, dataset, trajectory
+from model_helpers import TICK, dataset, rows_of, trajectory
 from torch import Tensor
 
 from offbeat import Batch, InputError, Scaler, Trajectory, delta, last_values
@@ -163,9 +163,9 @@ def test_take_also_takes_a_slice() -> None:
         assert torch.equal(getattr(got, name), getattr(expected, name)), name
 
 
-def test_rows_between_keeps_times_and_to_casts_values_alone() -> None:
+def test_casts_values_alone() -> None:
     batch = Batch.of(dataset(3))
-    part = batch.rows_between(2, 5)
+    part = rows_of(batch, 2, 5)
     assert part.rows == 3
     assert torch.equal(part.times, batch.times[:, 2:5])
     assert torch.equal(part.mask, batch.mask[:, 2:5])

@@ -20,6 +20,7 @@ from model_helpers import (
     draw_weights,
     error,
     predictions,
+    rows_of,
     small_model,
     trajectory,
     with_growing_decays,
@@ -190,7 +191,7 @@ def test_what_comes_at_or_after_a_row_changes_no_prediction_up_to_it(variant: st
         for changed in (other_values, other_mask, all_seen, other_times):
             got = predictions(model, changed)
             assert torch.equal(got[:, : row + 1], expected[:, : row + 1]), row
-        cut = predictions(model, batch.rows_between(0, row + 1))
+        cut = predictions(model, rows_of(batch, 0, row + 1))
         assert error(cut, expected[:, : row + 1]) < 1e-12
 
 
@@ -219,7 +220,7 @@ def test_a_value_moves_only_the_predictions_after_it(variant: str) -> None:
     model = build(variant)
     batch = model.batch(Dataset((trajectory(4, 7),)))
     values = batch.values.clone().requires_grad_()
-    output = model(replace(batch, values=values)).predictions
+    output = model(replace(batch, values=values)).mean
     for row in range(batch.rows):
         (found,) = torch.autograd.grad(output[0, row].sum(), values, retain_graph=True)
         assert not found[0, row:].any()
@@ -246,7 +247,7 @@ def test_hidden_values_leave_no_trace_in_gradients(variant: str) -> None:
     found = []
     for given in (batch, hidden):
         model.zero_grad()
-        (model(given).predictions * batch.valid[..., None]).square().sum().backward()
+        (model(given).mean * batch.valid[..., None]).square().sum().backward()
         found.append([p.grad.clone() for p in model.parameters() if p.grad is not None])
     for got, expected in zip(*found, strict=True):
         assert torch.equal(got, expected)
@@ -260,9 +261,9 @@ def in_parts(model: Model, batch: Batch, edges: list[int]) -> Tensor:
     parts = []
     with torch.no_grad():
         for start, stop in pairwise(edges):
-            output = model(batch.rows_between(start, stop), carry=carry)
-            carry = output.carry
-            parts.append(output.predictions)
+            output = model(rows_of(batch, start, stop), past=carry)
+            carry = output.past
+            parts.append(output.mean)
     return torch.cat(parts, dim=1) * batch.valid[..., None]
 
 
@@ -400,7 +401,7 @@ def test_asked_times_change_no_other_prediction_or_are_refused(name: str, choice
 def gradients(model: Model, batch: Batch) -> dict[str, Tensor | None]:
     model.zero_grad()
     target = torch.cos(torch.arange(batch.values.numel()).to(model.dtype)).view_as(batch.values)
-    loss = ((model(batch).predictions - target) * batch.valid[..., None]).square().sum()
+    loss = ((model(batch).mean - target) * batch.valid[..., None]).square().sum()
     loss.backward()
     return {name: p.grad for name, p in model.named_parameters()}
 

@@ -312,7 +312,7 @@ def test_row_by_row_gives_the_bits_of_the_whole_sequence(name: str, body: str) -
 def cut(rows: StepInputs, lanes: slice, at: slice) -> StepInputs:
     """Some rows of some trajectories; none of them is padding."""
     changed: dict[str, Any] = {"length": None}
-    for name in ("gap", "update", "values", "mask", "age", "updated", "decay_start", "decay_end",
+    for name in ("gap", "update", "values", "mask", "time_input", "updated", "decay_start", "decay_end",
                  "delta", "last"):  # fmt: skip
         value = getattr(rows, name)
         changed[name] = None if value is None else value[lanes, at]
@@ -392,9 +392,9 @@ def test_what_the_fused_body_cannot_run_goes_to_the_reference(
     model, batch = made("ode_rnn", options)
     rows, _ = model.step_inputs(batch)
     state = model.empty_state(len(batch)).state
-    assert why in cpu.unsupported(model.spec, model.scan_weights(), rows, state)
+    assert why in cpu.unsupported(model.spec, model.scan_parts(), rows, state)
     with pytest.raises(RuntimeError, match=why):
-        cpu.scan(model.spec, model.scan_weights(), rows, state)
+        cpu.scan(model.spec, model.scan_parts(), rows, state)
     monkeypatch.setattr(cpu, "scan", lambda *_: pytest.fail("the wrong body ran"))
     model(batch)
 
@@ -406,7 +406,7 @@ def test_every_model_of_the_zoo_runs_in_the_fused_body(
 ) -> None:
     monkeypatch.setattr(reference, "scan", lambda *_: pytest.fail("the wrong body ran"))
     model, batch = made(name, {})
-    model(batch).predictions.sum().backward()
+    model(batch).mean.sum().backward()
     monkeypatch.undo()
     with kernels.use("reference"):
         monkeypatch.setattr(cpu, "scan", lambda *_: pytest.fail("the wrong body ran"))
@@ -416,7 +416,7 @@ def test_every_model_of_the_zoo_runs_in_the_fused_body(
 def test_observed_values_that_need_a_gradient_go_to_the_reference_and_get_one() -> None:
     model, batch = made("anchored_ode_gru_d", {})
     batch = replace(batch, values=batch.values.clone().requires_grad_())
-    model(batch).predictions.sum().backward()
+    model(batch).mean.sum().backward()
     gradient = batch.values.grad
     assert gradient is not None
     assert bool((gradient[batch.mask] != 0).any())
@@ -439,9 +439,9 @@ def test_without_the_compiled_module_everything_runs_in_the_reference_body(
 ) -> None:
     monkeypatch.setattr(cpu, "compiled", None)
     monkeypatch.setattr(cpu, "why_not", "no module")
-    assert kernels.backend() == ("reference", "the compiled backend was not built: no module")
+    assert kernels.backend() == ("reference", "cpu: it was not built (no module)")
     model, batch = made("ode_gru_d", {})
-    assert bool(model(batch).predictions.isfinite().all())
+    assert bool(model(batch).mean.isfinite().all())
 
 
 # --- memory ---------------------------------------------------------------------------------------
@@ -453,7 +453,7 @@ def test_what_a_step_records_is_freed_with_it(name: str, monkeypatch: pytest.Mon
     model, batch = made(name, {})
     rows, _ = model.step_inputs(batch)
     kept = weakref.ref(rows.gap)
-    predictions, *_ = model.run(rows)
+    predictions = model.run(rows).mean
     predictions.sum().backward()
     del rows
     assert kept() is not None

@@ -128,7 +128,7 @@ def states_of(model: Model, data: Dataset) -> tuple[Tensor, Tensor, Tensor]:
             reference = model(batch)
     for name in ("predictions", "before", "after"):
         assert error(getattr(output, name), getattr(reference, name)) < 1e-13, name
-    return output.predictions[0], output.before[0], output.after[0]
+    return output.mean[0], output.before[0], output.after[0]
 
 
 # --- cells against torch.nn -----------------------------------------------------------------------
@@ -737,7 +737,7 @@ def check_gradients(model: Model, batch: Batch, *, fast: bool = False) -> None:
     def run(*values: Tensor) -> Tensor:
         given = dict(zip(names, values, strict=True))
         output = torch.func.functional_call(model, given, (batch,))
-        return output.predictions.sum(dim=0)
+        return output.mean.sum(dim=0)
 
     torch.autograd.gradcheck(run, weights, fast_mode=fast)
 
@@ -791,7 +791,7 @@ def test_the_adjoint_method_gives_the_gradients_of_backpropagation(
     found = []
     for gradient in ("backprop", "adjoint"):
         model = with_growing_decays(small_model(name, gradient=gradient, **options))
-        model(model.batch(data)).predictions.square().sum().backward()
+        model(model.batch(data)).mean.square().sum().backward()
         found.append({k: p.grad for k, p in model.named_parameters()})
     for key, expected in found[0].items():
         assert error(found[1][key], expected) < 1e-6, key
@@ -994,4 +994,4 @@ def test_a_carry_without_a_generator_cannot_feed_itself() -> None:
     batch = model.batch(sample())
     carry = replace(model.empty_state(1), generator=None)
     with pytest.raises(InputError, match="the carry needs a generator"):
-        model(batch, carry=carry)
+        model(batch, past=carry)

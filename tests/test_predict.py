@@ -13,7 +13,7 @@ from offbeat.models.zoo import ZOO
 def test_predictions_are_the_models_own_in_original_units(name):
     data = dataset(3)
     model = small_model(name, data, scaler="standardise")
-    scaled = model(model.batch(data)).predictions.detach().double().numpy()
+    scaled = model(model.batch(data)).mean.detach().double().numpy()
     for trajectory, got, expected in zip(data, ob.predict(model, data), scaled, strict=True):
         assert np.array_equal(got.times, trajectory.times)
         expected = model.scaler.original(expected[: trajectory.rows])

@@ -33,7 +33,7 @@ def test_each_scoring_counts_the_cells_it_names():
     error = torch.tensor([[[1.0, 2.0], [3.0, 5.0], [7.0, 11.0], [13.0, 17.0]]])
     scores = scores_of(batch, batch.values + error)
     # honest: channel 0 at rows 2 and 3, channel 1 at row 3
-    assert scores.after_first_observation.cells == 3
+    assert scores.after_first_observation.count == 3
     assert scores.after_first_observation.mse == pytest.approx((7**2 + 13**2 + 17**2) / 3)
     assert scores.after_first_observation.per_channel == pytest.approx(((7**2 + 13**2) / 2, 17**2))
     assert scores.masked.mse == pytest.approx((13**2 + 17**2) / 2)
@@ -70,10 +70,10 @@ def test_cells_that_are_not_known_and_padding_count_nowhere():
     short = trajectory([[1.0, 1.0], [2.0, 2.0]])
     batch = Batch.of([long, short], dtype=torch.float64)
     scores = scores_of(batch, torch.full((2, 3, 2), 1e3))
-    assert scores.published.cells == 5 + 4
-    assert scores.after_first_row.cells == 4 + 2
+    assert scores.published.count == 5 + 4
+    assert scores.after_first_row.count == 4 + 2
     assert (
-        scores.after_first_observation.cells == 2 + 1 + 2
+        scores.after_first_observation.count == 2 + 1 + 2
     )  # channel 1 of the long one is first seen in row 1
 
 
@@ -92,7 +92,7 @@ def test_parts_add_up_to_the_whole():
     assert split.after_first_observation.mse == pytest.approx(
         whole.after_first_observation.mse, rel=1e-12
     )
-    assert split.by_gap[0].score.cells == whole.by_gap[0].score.cells
+    assert split.by_gap[0].score.count == whole.by_gap[0].score.count
 
 
 def test_scores_by_gap_group_by_the_age_of_the_channel():
@@ -104,7 +104,7 @@ def test_scores_by_gap_group_by_the_age_of_the_channel():
     assert [g.up_to for g in groups] == pytest.approx([0.1, 0.2, 0.4, 0.8])
     assert [g.above for g in groups] == pytest.approx([0.0, 0.1, 0.2, 0.4])
     assert [g.score.mse for g in groups] == pytest.approx([1, 4, (9 + 16) / 2, 25])
-    assert sum(g.score.cells for g in groups) == 5
+    assert sum(g.score.count for g in groups) == 5
 
 
 def test_the_last_value_predictor_repeats_what_was_seen_and_starts_from_the_mean():

@@ -20,12 +20,16 @@ class ModelConfig:
         name: id of the zoo's entry: `rnn`, `lstm`, `gru`, `rnn_decay`, `gru_d`, `neural_ode`,
             `ode_rnn`, `ode_gru_d`, `anchored_ode_gru_d`.
         hidden_size: units of the hidden state h.
-        decoder_units: hidden layers of the decoder that reads a prediction off the state.
+        head: how a state becomes a prediction, and its loss: `point`, the expected value and the
+            mean squared error; `gaussian`, a mean and a standard deviation and the negative
+            log-likelihood; or a head of one's own.
+        decoder_units: hidden layers of the head's decoder.
         cell: update at an observation. `gru` is equations 20-23, `elman` 6, `lstm` 14-19; `none`
-            leaves the state to the flow.
+            leaves the state to the vector field. Or a cell of one's own.
         reset_after: GRU whose reset gate acts after the recurrent product, as in `torch.nn.GRU`,
             instead of before it, as in equation 22.
-        vector_field: `mlp`, a neural ODE between observations (equation 36), or `none`.
+        vector_field: `mlp`, a neural ODE between observations (equation 36), `none`, or a vector
+            field of one's own.
         field_units: hidden layers of the vector field.
         activation: nonlinearity of the vector field.
         solver: how the vector field is integrated over a gap.
@@ -65,10 +69,11 @@ class ModelConfig:
 
     name: str = "anchored_ode_gru_d"
     hidden_size: int | None = None
+    head: str | None = None
     decoder_units: tuple[int, ...] | None = None
-    cell: Literal["none", "elman", "lstm", "gru"] | None = None
+    cell: str | None = None
     reset_after: bool | None = None
-    vector_field: Literal["none", "mlp"] | None = None
+    vector_field: str | None = None
     field_units: tuple[int, ...] | None = None
     activation: Activation | None = None
     solver: Solver | None = None
@@ -124,8 +129,6 @@ class ModelConfig:
 
 
 _CHOICES: dict[str, tuple[str, ...]] = {
-    "cell": ("none", "elman", "lstm", "gru"),
-    "vector_field": ("none", "mlp"),
     "activation": ("tanh", "silu"),
     "solver": ("euler", "midpoint", "heun", "rk4", "dopri5", "tsit5"),
     "gradient": ("backprop", "adjoint"),
@@ -224,7 +227,7 @@ class SplitConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How a model is trained. The defaults are the thesis' protocol.
+    """How a model is trained. A field left at None takes the value of the model's recipe.
 
     Attributes:
         epochs: passes over the training trajectories.
@@ -232,39 +235,75 @@ class TrainConfig:
         optimizer: `adamax`, `adam`, `adamw` or `sgd`.
         learning_rate: of the optimizer, at the start.
         schedule: `constant`, or `cosine` decay to zero over all steps.
-        clip_norm: gradients are scaled down to this global norm; None leaves them.
-        loss_scale: the mean squared error is multiplied by this. Adam-like optimizers do not
-            notice; `clip_norm` does.
-        seed: of the order of the batches (and the generator of self-feeding).
+        clip_norm: gradients are scaled down to this global norm; math.inf never does.
+        loss_scale: the loss is multiplied by this. Adam-like optimizers do not notice; `clip_norm`
+            does.
+        seed: of the order of the batches and of self-feeding.
         patience: stop when the validation MSE has not improved for so many epochs; None never
             stops early.
         keep: weights that `fit` leaves in the model: of the `last` epoch, or of the `best`
-            validation MSE.
+            validation MSE; by default the best where there is a validation set.
         checkpoint_every: steps between checkpoints inside an epoch; None writes one at the end
             of each epoch only.
     """
 
-    epochs: int = 50
-    batch_size: int = 50
-    optimizer: Literal["adamax", "adam", "adamw", "sgd"] = "adamax"
-    learning_rate: float = 1e-3
-    schedule: Literal["constant", "cosine"] = "constant"
+    epochs: int | None = None
+    batch_size: int | None = None
+    optimizer: Literal["adamax", "adam", "adamw", "sgd"] | None = None
+    learning_rate: float | None = None
+    schedule: Literal["constant", "cosine"] | None = None
+    clip_norm: float | None = None
+    loss_scale: float | None = None
+    seed: int = 0
+    patience: int | None = None
+    keep: Literal["last", "best"] | None = None
+    checkpoint_every: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in (
+            ("optimizer", ("adamax", "adam", "adamw", "sgd")),
+            ("schedule", ("constant", "cosine")),
+            ("keep", ("last", "best")),
+        ):
+            if getattr(self, name) is not None:
+                one_of(f"value of {name}", getattr(self, name), choices)
+        check_seed(self.seed)
+        for name in ("epochs", "batch_size", "patience", "checkpoint_every"):
+            _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        for name in ("learning_rate", "loss_scale"):
+            _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
+        _check(self, "clip_norm", lambda v: v > 0, "a positive number")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A `TrainConfig` with every choice made: how a model is in fact trained.
+
+    Attributes:
+        epochs: as in `TrainConfig`, as are all others.
+        batch_size: trajectories per step.
+        optimizer: name of the optimizer.
+        learning_rate: at the start.
+        schedule: of the learning rate.
+        keep: weights that `fit` leaves in the model.
+        clip_norm: largest norm of the gradients; None leaves them.
+        loss_scale: factor of the loss.
+        seed: of the order of the batches and of self-feeding.
+        patience: epochs without improvement; None never stops early.
+        checkpoint_every: steps; None writes a checkpoint per epoch.
+    """
+
+    epochs: int
+    batch_size: int
+    optimizer: str
+    learning_rate: float
+    schedule: str
+    keep: str
     clip_norm: float | None = None
     loss_scale: float = 1.0
     seed: int = 0
     patience: int | None = None
-    keep: Literal["last", "best"] = "last"
     checkpoint_every: int | None = None
-
-    def __post_init__(self) -> None:
-        one_of("optimizer", self.optimizer, ("adamax", "adam", "adamw", "sgd"))
-        one_of("schedule", self.schedule, ("constant", "cosine"))
-        one_of("value of keep", self.keep, ("last", "best"))
-        check_seed(self.seed)
-        for name in ("epochs", "batch_size", "patience", "checkpoint_every"):
-            _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
-        for name in ("learning_rate", "clip_norm", "loss_scale"):
-            _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
 
 
 def check_seed(seed: int) -> int:

@@ -1,4 +1,4 @@
-"""Evaluation: models and the trivial predictor, scored in the same call on the same cells."""
+"""Evaluation: models and the last value, scored in the same call on the same values."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from offbeat.data.batch import last_index
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
 from offbeat.metrics import Scores, ScoreSums, last_value_predictions, table
-from offbeat.models.model import Model
+from offbeat.models.base import BaseModel
 from offbeat.training import validate
 
 LAST_VALUE = "last_value"
-"""Name of the trivial predictor that stands in every table."""
+"""Name of the predictor that repeats the last observed value; it is in every table."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Evaluation:
         scaler: what the scaled units are: `standardise`, `divide_by_max`, ...
         channel_scale: per channel, one scaled unit in the channel's unit.
         trajectories: how many were scored.
-        channel_cells: per channel, how many cells were scored.
+        channel_counts: per channel, how many values were scored.
     """
 
     scores: Mapping[str, Scores]
@@ -38,7 +38,7 @@ class Evaluation:
     scaler: str
     channel_scale: tuple[float, ...]
     trajectories: int
-    channel_cells: tuple[int, ...]
+    channel_counts: tuple[int, ...]
 
     def table(self, *, notes: Mapping[str, str] | None = None) -> str:
         """A plain-text table of RMSE in scaled units, best first."""
@@ -56,7 +56,7 @@ class Evaluation:
             "one step ahead",
             self.names,
             self.units,
-            self.channel_cells,
+            self.channel_counts,
             {name: tuple(self.channel_rmse(name).values()) for name in self.scores},
             {name: scores.after_first_observation.rmse for name, scores in self.scores.items()},
             (LAST_VALUE,),
@@ -80,19 +80,21 @@ class Evaluation:
         }
 
 
-def evaluate(models: Model | Mapping[str, Model], dataset: Dataset, *, seed: int = 0) -> Evaluation:
+def evaluate(
+    models: BaseModel | Mapping[str, BaseModel], dataset: Dataset, *, seed: int = 0
+) -> Evaluation:
     """Scores one-step-ahead predictions of one or more models, and of the last observed value.
 
     Args:
         models: one model, or several by name; several must share scaler and training means.
-        dataset: masked or not; hidden cells that are known are scored.
-        seed: of the generator of self-feeding.
+        dataset: masked values that are known are scored too.
+        seed: of self-feeding.
 
     Raises:
         InputError: the data has other channels than a model, or models score in other units.
     """
-    if isinstance(models, Model):
-        models = {models.config.name: models}
+    if isinstance(models, BaseModel):
+        models = {models.name: models}
     if not models or LAST_VALUE in models:
         raise InputError(f"give at least one model, none of them named {LAST_VALUE!r}")
     first = next(iter(models.values()))
@@ -107,7 +109,7 @@ def evaluate(models: Model | Mapping[str, Model], dataset: Dataset, *, seed: int
                 "training means differ; train both on the same data, or evaluate them apart"
             )
     batch = first.batch(dataset)
-    counted = batch.known & batch.valid[..., None] & (last_index(batch.mask) >= 0)
+    counted = batch.targets & (last_index(batch.mask) >= 0)
     trivial = ScoreSums(batch.channels, gap_unit=first.statistics.median_gap)
     trivial.add(last_value_predictions(batch, first.mean), batch)
     scores = {name: validate(model, batch, seed=seed) for name, model in models.items()}

@@ -1,7 +1,9 @@
 """Scores of predictions against a batch: what counts, by name.
 
-`after_first_observation` is the default everywhere. `after_first_row` and `published` stand beside it because published
-numbers use them; `docs/deviations.md` says what they contain.
+`after_first_observation` is the default everywhere: it counts known values after the first
+observation of their channel, which is the honest choice, since before it every model can only
+predict the mean. `after_first_row` and `published` are given beside it because published numbers
+use them; `docs/deviations.md` says what they contain.
 """
 
 from __future__ import annotations
@@ -24,14 +26,14 @@ class Score:
     """A mean squared error, in scaled units.
 
     Attributes:
-        mse: over all cells that count; NaN when there is none.
+        mse: over all values that count; NaN when there is none.
         per_channel: the same per channel.
-        cells: how many cells counted.
+        count: how many values counted.
     """
 
     mse: float
     per_channel: tuple[float, ...]
-    cells: int
+    count: int
 
     @property
     def rmse(self) -> float:
@@ -41,12 +43,12 @@ class Score:
 
 @dataclass(frozen=True)
 class GapScore:
-    """The score after the first observation, of the entries whose channel was last observed within a range of ages.
+    """The score of values whose channel was last observed within a range of times.
 
     Attributes:
-        above: s, age is above this.
+        above: s, the time since observation is above this.
         up_to: s, and at most this.
-        score: of those cells.
+        score: of those values, after the first observation.
     """
 
     above: float
@@ -59,12 +61,13 @@ class Scores:
     """All scorings of one predictor on one data set.
 
     Attributes:
-        after_first_observation: known cells after their channel's first observation, observed or hidden.
-        masked: those of them that are hidden.
-        after_first_row: known cells of all rows but the first.
+        after_first_observation: known values after their channel's first observation, observed or
+            masked.
+        masked: those of them that are masked.
+        after_first_row: known values of all rows but the first.
         published: all rows, where the prediction of row 0 is the observed row 0, filled with zeros
-            where it is hidden: what the thesis reports.
-        by_gap: after the first observation, by the age of the channel's last observation.
+            where it is masked: what the thesis reports.
+        by_gap: after the first observation, by the time since the channel's last observation.
     """
 
     after_first_observation: Score
@@ -74,7 +77,7 @@ class Scores:
     by_gap: tuple[GapScore, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form; a score without cells has null for its error."""
+        """JSON-like form; a score without values has null for its error."""
         result: dict[str, Any] = {name: _plain(getattr(self, name)) for name in SCORINGS}
         result["by_gap"] = [
             {"above_s": g.above, "up_to_s": g.up_to, **_plain(g.score)} for g in self.by_gap
@@ -89,7 +92,7 @@ def _plain(score: Score) -> dict[str, Any]:
     return {
         "mse": number(score.mse),
         "rmse": number(score.rmse),
-        "cells": score.cells,
+        "count": score.count,
         "per_channel_mse": [number(v) for v in score.per_channel],
     }
 
@@ -99,7 +102,7 @@ class ScoreSums:
 
     Args:
         channels: number of channels.
-        gap_unit: s; ages are grouped at 1, 2, 4, 8, ... times this. None leaves `by_gap` empty.
+        gap_unit: s; times since observation are grouped at 1, 2, 4, 8, ... times this. None leaves `by_gap` empty.
     """
 
     def __init__(self, channels: int, *, gap_unit: float | None = None) -> None:
@@ -115,7 +118,7 @@ class ScoreSums:
             batch: what was observed and what is known.
         """
         squared = (predictions.double() - batch.values.double()) ** 2
-        known = batch.known & batch.valid[..., None]
+        known = batch.targets
         mask = batch.mask & batch.valid[..., None]
         seen = last_index(mask) >= 0
         counted = known & seen
@@ -127,8 +130,8 @@ class ScoreSums:
         shown = torch.where(mask[:, 0], 0.0, batch.values[:, 0].double() ** 2)
         self._add("published", torch.cat([shown[:, None], squared[:, 1:]], dim=1), known)
         if self.gap_unit is not None:
-            age = delta(batch.times, mask) / self.gap_unit
-            group = torch.ceil(torch.log2(age.clamp_min(1.0)) - 1e-6).long()
+            since = delta(batch.times, mask) / self.gap_unit
+            group = torch.ceil(torch.log2(since.clamp_min(1.0)) - 1e-6).long()
             for k in torch.unique(group[counted]).tolist():
                 self._add(int(k), squared, counted & (group == k))
 
@@ -154,13 +157,13 @@ class ScoreSums:
         if name not in self._sums:
             return Score(float("nan"), (float("nan"),) * self.channels, 0)
         total, count = self._sums[name]
-        cells = int(count.sum())
-        mse = float(total.sum()) / cells if cells else float("nan")
-        return Score(mse, tuple((total / count).tolist()), cells)
+        entries = int(count.sum())
+        mse = float(total.sum()) / entries if entries else float("nan")
+        return Score(mse, tuple((total / count).tolist()), entries)
 
 
 def last_value_predictions(batch: Batch, mean: Tensor) -> Tensor:
-    """The trivial predictor: repeat each channel's last observed value, the mean before any.
+    """The last-value predictor: repeat each channel's last observed value, the mean before any.
 
     Args:
         batch: scaled.
@@ -174,12 +177,12 @@ def last_value_predictions(batch: Batch, mean: Tensor) -> Tensor:
 
 
 def row_0_constant(batch: Batch) -> float:
-    """The c of `published = (1 - 1/rows) after_first_row + c (hidden share of rows 0) / rows`.
+    """The c of `published = (1 - 1/rows) after_first_row + c (masked fraction of rows 0) / rows`.
 
-    The mean square of those rows 0 that are hidden, for whole rows hidden and equal lengths.
+    The mean square of those rows 0 that are masked, for whole rows masked and equal lengths.
     """
-    hidden = batch.known[:, 0] & ~batch.mask[:, 0]
-    return float((batch.values[:, 0].double()[hidden] ** 2).mean())
+    masked = batch.known[:, 0] & ~batch.mask[:, 0]
+    return float((batch.values[:, 0].double()[masked] ** 2).mean())
 
 
 def _shown(rmse: float) -> str:

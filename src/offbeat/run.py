@@ -17,12 +17,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from offbeat.config import TrainConfig
-from offbeat.data.batch import Batch
+from offbeat.config import Recipe
+from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
 from offbeat.files import write_text
-from offbeat.kernels import backend
+from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_training_state, save_training_state
+from offbeat.models.foreign import ForeignModel
 from offbeat.models.model import Model
 
 
@@ -58,7 +59,7 @@ class FlatParameters:
         flat: every parameter, in the order of `model.parameters()`; its gradient is theirs.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: BaseModel) -> None:
         self._own = list(model.parameters())
         flat = torch.cat([p.detach().reshape(-1) for p in self._own])
         self.flat = torch.nn.Parameter(flat)
@@ -83,7 +84,7 @@ class FlatParameters:
 
 
 @contextmanager
-def flat_parameters(model: Model) -> Iterator[FlatParameters]:
+def flat_parameters(model: BaseModel) -> Iterator[FlatParameters]:
     """Lets a model's parameters lie in one piece while it is trained.
 
     Args:
@@ -101,12 +102,12 @@ class RunState:
 
     Args:
         parameters: what the optimizer moves.
-        config: names the optimizer.
+        recipe: names the optimizer.
     """
 
-    def __init__(self, parameters: FlatParameters, config: TrainConfig) -> None:
+    def __init__(self, parameters: FlatParameters, recipe: Recipe) -> None:
         self.parameters = parameters
-        self.optimizer = _optimizer(parameters.flat, config)
+        self.optimizer = _optimizer(parameters.flat, recipe)
         self.epoch = 0  # epochs done
         self.step = 0  # steps done within the epoch
         self.total_steps = 0
@@ -118,45 +119,77 @@ class RunState:
         self.best: dict[str, Tensor] = {}
 
 
-def _optimizer(flat: torch.nn.Parameter, config: TrainConfig) -> torch.optim.Optimizer:
+def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimizer:
     kinds: dict[str, Any] = {
         "adamax": torch.optim.Adamax,
         "adam": torch.optim.Adam,
         "adamw": torch.optim.AdamW,
         "sgd": torch.optim.SGD,
     }
-    optimizer: torch.optim.Optimizer = kinds[config.optimizer](
-        [flat], lr=config.learning_rate, foreach=True
+    optimizer: torch.optim.Optimizer = kinds[recipe.optimizer](
+        [flat], lr=recipe.learning_rate, foreach=True
     )
     return optimizer
 
 
-def identity_of(model: Model, config: TrainConfig, batch: Batch) -> dict[str, Any]:
+def identity_of(
+    model: BaseModel, recipe: Recipe, train: Dataset, validation: Dataset | None
+) -> dict[str, Any]:
     """What must be the same for a run to go on: anything else would end in other numbers.
 
     Args:
         model: as it stands before the first step.
-        config: of the training.
-        batch: the training part.
+        recipe: of the training.
+        train: the training set.
+        validation: the validation set, or None.
     """
     weights = hashlib.sha256()
     for value in model.state_dict().values():
         weights.update(value.detach().cpu().numpy().tobytes())
+    options: dict[str, Any] = {}
+    if isinstance(model, Model):
+        options = asdict(model.config)
+    elif isinstance(model, ForeignModel):
+        options = model.options
     identity: dict[str, Any] = {
-        "model": asdict(model.config),
-        "train": asdict(config),
+        "model": {"name": model.name, **options},
+        "training": asdict(recipe),
+        "scaler": model.scaler.to_dict(),
+        "statistics": model.statistics.to_dict(),
         "initial_weights": weights.hexdigest(),
-        "trajectories": len(batch),
-        "observed_cells": int(batch.mask.sum()),
-        "checksum": float(batch.values.double().sum() + batch.times.sum()),
+        "train": _part(train),
+        "validation": None if validation is None else _part(validation),
     }
-    if config.schedule == "constant":
-        identity["train"].pop("epochs")  # such a run can be trained for longer
+    if recipe.schedule == "constant":
+        identity["training"].pop("epochs")  # such a run can be trained for longer
     plain: dict[str, Any] = json.loads(json.dumps(identity))  # lists for tuples, as it is read back
     return plain
 
 
-def save_run(folder: Path, model: Model, state: RunState, identity: dict[str, Any]) -> None:
+def _part(dataset: Dataset) -> dict[str, Any]:
+    """What is compared of a data set, from what a user sees at once to every bit."""
+    return {
+        "channels": [f"{n} [{u}]" for n, u in zip(dataset.names, dataset.units, strict=True)],
+        "trajectories": len(dataset),
+        "rows": sum(t.rows for t in dataset),
+        "observed": sum(int(t.observed.sum()) for t in dataset),
+        "fingerprint": dataset.fingerprint(),
+    }
+
+
+_WORDS = {
+    "model": "model options",
+    "training": "training options",
+    "scaler": "scaler",
+    "statistics": "means, scales or gaps of the training set",
+    "initial_weights": "initial weights (the seed or the model differs)",
+    "train": "training set",
+    "validation": "validation set",
+}
+"""What the parts of an identity are called in messages."""
+
+
+def save_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str, Any]) -> None:
     """Writes a checkpoint of a run, and then removes the one before.
 
     Args:
@@ -168,7 +201,7 @@ def save_run(folder: Path, model: Model, state: RunState, identity: dict[str, An
     tensors = {f"best.{k}": v for k, v in state.best.items()}
     for name, value in state.optimizer.state.get(state.parameters.flat, {}).items():
         tensors[f"optimizer.{name}"] = torch.as_tensor(value)
-    facts = {
+    record = {
         "identity": identity,
         "epoch": state.epoch,
         "step": state.step,
@@ -178,21 +211,20 @@ def save_run(folder: Path, model: Model, state: RunState, identity: dict[str, An
         "best_mse": state.best_mse if math.isfinite(state.best_mse) else None,
         "best_epoch": state.best_epoch,
         "history": [
-            {k: None if v != v else v for k, v in asdict(record).items()}
-            for record in state.history
+            {k: None if v != v else v for k, v in asdict(epoch).items()} for epoch in state.history
         ],
         "torch_threads": torch.get_num_threads(),
-        "scan_backend": backend()[0],
+        "backend": model.backend()[0],
     }
     checkpoints = folder / "checkpoints"
     name = f"steps-{state.total_steps:09d}"
-    save_training_state(model, tensors, facts, checkpoints / name)
+    save_training_state(model, tensors, record, checkpoints / name)
     for old in sorted(checkpoints.glob("steps-*")):
         if old.name != name:
             shutil.rmtree(old)
 
 
-def resume_run(folder: Path, model: Model, state: RunState, identity: dict[str, Any]) -> None:
+def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str, Any]) -> None:
     """Takes up the last checkpoint of a run, if there is one.
 
     Args:
@@ -215,12 +247,13 @@ def resume_run(folder: Path, model: Model, state: RunState, identity: dict[str, 
                 "give a new folder"
             )
         return
-    weights, tensors, facts = load_training_state(checkpoints[-1])
+    weights, tensors, kept = load_training_state(checkpoints[-1])
     for part, now in identity.items():
-        if facts["identity"].get(part) != now:
+        then = kept["identity"].get(part)
+        if then != now:
             raise InputError(
-                f"{folder} holds a run with another {_difference(facts['identity'].get(part), now)}"
-                f" ({part}); give the same, or another folder"
+                f"{folder} holds a run with another {_WORDS[part]}{_difference(then, now)}; give "
+                "the same, or another folder"
             )
     model.load_state_dict(weights)
     prefix = "optimizer."
@@ -229,19 +262,26 @@ def resume_run(folder: Path, model: Model, state: RunState, identity: dict[str, 
         state.optimizer.state[state.parameters.flat] = moments
     state.best = {k[len("best.") :]: v for k, v in tensors.items() if k.startswith("best.")}
     for name in ("epoch", "step", "total_steps", "loss_sum", "seconds", "best_epoch"):
-        setattr(state, name, facts[name])
-    state.best_mse = math.inf if facts["best_mse"] is None else facts["best_mse"]
-    for record in facts["history"]:
+        setattr(state, name, kept[name])
+    state.best_mse = math.inf if kept["best_mse"] is None else kept["best_mse"]
+    for record in kept["history"]:
         fields_: dict[str, Any] = {k: math.nan if v is None else v for k, v in record.items()}
         state.history.append(EpochRecord(**fields_))
     write_log(folder, state.history)
 
 
 def _difference(then: Any, now: Any) -> str:
-    if isinstance(then, dict) and isinstance(now, dict):
-        keys = [k for k in now if then.get(k) != now[k]]
-        return ", ".join(f"{k} ({then.get(k)!r} then, {now[k]!r} now)" for k in keys)
-    return f"value ({then!r} then, {now!r} now)"
+    """What differs, as far as it can be said in a few words."""
+    if not isinstance(then, dict) or not isinstance(now, dict):
+        one_is_missing = then is None or now is None
+        return f" ({'none' if then is None else 'one'} then)" if one_is_missing else ""
+    keys = [key for key in now if then.get(key) != now[key]]
+    short = [key for key in keys if key != "fingerprint" and not isinstance(now[key], list)]
+    if keys == ["fingerprint"]:
+        return " (the same size, other values, times, masks or order)"
+    if not short:
+        return f" ({', '.join(keys)})"
+    return f" ({', '.join(f'{key} {then.get(key)!r} then, {now[key]!r} now' for key in short)})"
 
 
 def write_log(folder: Path, history: list[EpochRecord]) -> None:

@@ -68,7 +68,7 @@ def predict(
         # The same generator for each part, as if they were one batch.
         generator = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
         with torch.inference_mode():
-            scaled = model(batch, generator=generator).predictions.double().numpy()
+            scaled = model(batch, generator=generator).mean.double().numpy()
         for (union, rows), trajectory, values in zip(merged, part, scaled, strict=True):
             results.append(
                 Trajectory(

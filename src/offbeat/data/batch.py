@@ -1,8 +1,8 @@
-"""Padded tensors, the only place that pads; and the ages that follow from times and masks."""
+"""Padded tensors, the only place that pads; and times since observation, from times and masks."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -12,6 +12,9 @@ from torch import Tensor
 from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
+
+STATE, ACTION, EXOGENOUS = "state", "action", "exogenous"
+"""Roles of channels: seen and predicted; predicted and seen one row later; seen only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +27,7 @@ class Batch:
         mask: (batch, rows, channels) bool, True = observed.
         known: (batch, rows, channels) bool, True = the score knows the value.
         valid: (batch, rows) bool, False = padding.
+        roles: per channel `state`, `action` or `exogenous`; by default all are `state`.
     """
 
     times: Tensor
@@ -31,6 +35,11 @@ class Batch:
     mask: Tensor
     known: Tensor
     valid: Tensor
+    roles: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.roles:
+            object.__setattr__(self, "roles", (STATE,) * self.values.shape[2])
 
     @classmethod
     def of(
@@ -39,6 +48,7 @@ class Batch:
         *,
         scaler: Scaler | None = None,
         dtype: torch.dtype = torch.float32,
+        roles: tuple[str, ...] | None = None,
     ) -> Batch:
         """Pads trajectories into one batch.
 
@@ -46,6 +56,7 @@ class Batch:
             trajectories: at least one; all of the same channels.
             scaler: applied to the values; None leaves them in their units.
             dtype: of `values`; times are always float64.
+            roles: of the channels; by default those of the trajectories.
 
         Raises:
             InputError: there is no trajectory, or numbers of channels differ.
@@ -80,6 +91,7 @@ class Batch:
             torch.from_numpy(mask),
             torch.from_numpy(known),
             torch.from_numpy(valid),
+            roles or tuple(getattr(trajectories[0], "roles", ())),
         )
 
     def __len__(self) -> int:
@@ -95,22 +107,57 @@ class Batch:
         """Number of channels."""
         return self.values.shape[2]
 
+    def _tensors(self) -> Iterator[tuple[str, Tensor]]:
+        """Name and value of every tensor."""
+        for field in fields(self):
+            if field.name != "roles":
+                yield field.name, getattr(self, field.name)
+
     def take(self, index: Tensor | slice) -> Batch:
         """The trajectories at these positions, trimmed to the longest of them."""
         valid = self.valid[index]
         rows = int(valid.sum(dim=1).max())
-        return Batch(**{f.name: getattr(self, f.name)[index][:, :rows] for f in fields(self)})
+        return replace(self, **{k: v[index][:, :rows] for k, v in self._tensors()})
 
-    def rows_between(self, start: int, stop: int) -> Batch:
-        """The rows from `start` up to, not including, `stop`, times unchanged."""
-        return Batch(**{f.name: getattr(self, f.name)[:, start:stop] for f in fields(self)})
+    @property
+    def targets(self) -> Tensor:
+        """(batch, rows, channels) bool, True where a prediction can be scored: known and wanted."""
+        known = self.known & self.valid[..., None]
+        if all(role != EXOGENOUS for role in self.roles):
+            return known
+        wanted = [role != EXOGENOUS for role in self.roles]
+        return known & torch.tensor(wanted, device=known.device)
+
+    def inputs(self, last: Tensor, seen: Tensor) -> Batch:
+        """What a model may look at on arrival at each row: an action is seen one row later.
+
+        An action is chosen at its row, from what is observed there. So it is a target of its own
+        row and an input of the next.
+
+        Args:
+            last: (batch, channels) actions of the row before the first.
+            seen: (batch, channels) bool, where there were any.
+
+        Returns:
+            The batch with the values and masks of `action` channels moved by one row; `known` is
+            unchanged.
+        """
+        acts = torch.tensor([role == ACTION for role in self.roles], device=self.mask.device)
+        if not bool(acts.any()):
+            return self
+        values = torch.cat([last[:, None].to(self.values), self.values[:, :-1]], dim=1)
+        mask = torch.cat([seen[:, None], self.mask[:, :-1]], dim=1) & self.valid[..., None]
+        return replace(
+            self,
+            values=torch.where(acts, values, self.values),
+            mask=torch.where(acts, mask, self.mask),
+        )
 
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Batch:
         """Moves all tensors, and casts `values`; times stay float64."""
-        moved = {f.name: getattr(self, f.name).to(device) for f in fields(self)}
-        batch = Batch(**moved)
+        batch = replace(self, **{k: v.to(device) for k, v in self._tensors()})
         return batch if dtype is None else replace(batch, values=batch.values.to(dtype))
 
 
@@ -123,6 +170,8 @@ def last_index(mask: Tensor) -> Tensor:
     Returns:
         (..., rows, channels) int64.
     """
+    if mask.shape[-2] == 1:  # a stream: nothing stands before its one row
+        return torch.full_like(mask, -1, dtype=torch.int64)
     rows = torch.arange(mask.shape[-2], device=mask.device)[:, None]
     latest = torch.where(mask, rows, -1).cummax(dim=-2).values
     return torch.cat([torch.full_like(latest[..., :1, :], -1), latest[..., :-1, :]], dim=-2)
@@ -134,7 +183,7 @@ def delta(times: Tensor, mask: Tensor, *, since: Tensor | None = None) -> Tensor
     Args:
         times: (..., rows) float64, s.
         mask: (..., rows, channels) bool, True = observed.
-        since: (..., channels) s, what a channel's age counts from before its first observation;
+        since: (..., channels) s, what the time counts from before a channel's first observation;
             by default the time of the first row, as in equation 25.
 
     Returns:

@@ -1,9 +1,10 @@
-"""The compiled backend of the scan: all rows, forward and backward, in one call of compiled code.
+"""The compiled backend of the scan: all steps, forward and backward, in one call of C++.
 
-The compiled module holds a body per instruction set and runs the best one that the processor has.
-Blocks of trajectories run through all rows by themselves, spread over `torch.get_num_threads()`
+The compiled module has code for several instruction sets and runs the best that the processor has.
+Blocks of trajectories run through all steps by themselves, spread over `torch.get_num_threads()`
 threads; the result does not depend on how many, bit for bit. A trajectory's result depends neither
-on its batch mates nor on its place in the batch, and the rows of a stream give the bits of a batch.
+on its batch mates nor on its place in the batch, and the steps of a stream give the bits of a
+batch.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from torch.autograd.function import once_differentiable
 from offbeat.kernels.spec import (
     QUANTITIES,
     Layers,
+    ScanParts,
     ScanSpec,
-    ScanWeights,
     StepInputs,
     TableSteps,
 )
@@ -48,7 +49,7 @@ ROWS_AT_ONCE = 0
 evaluations, whichever rows those are (`benchmarks/scaling.py` says what others cost). It changes no
 bit: each sum has its order."""
 
-_CELLS = {"none": 0, "set": 1, "elman": 2, "lstm": 3, "gru": 4}
+_CELLS = {"none": 0, "start": 1, "elman": 2, "lstm": 3, "gru": 4}
 _ACTIVATIONS = {"tanh": 0, "silu": 1}
 _DECAY_ROWS = {"continuous": 0, "every_row": 1, "observed_rows": 2}
 _TYPES = {torch.float32: "f32", torch.float64: "f64"}
@@ -94,55 +95,70 @@ def suffix(dtype: torch.dtype) -> str:
     return _TYPES[dtype]
 
 
-def unsupported(
-    spec: ScanSpec, weights: ScanWeights, rows: StepInputs | TableSteps, state: Tensor
-) -> str:
-    """Why the compiled backend can't run a scan; empty where it can."""
+def supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | None:
+    """None where this backend runs scans of a spec, else the reason why not."""
     if compiled is None:
         return f"it was not built ({why_not})"
+    if spec.cell not in _CELLS:
+        return f"the cell {spec.cell!r} is not one of {', '.join(_CELLS)}"
+    if spec.field and spec.field_kind != "mlp":
+        return f"the vector field {spec.field_kind!r} is not mlp"
     if spec.field and tableau(spec.solver).adaptive:
         return f"the solver {spec.solver} chooses its own steps"
     if spec.field and spec.adjoint:
         return "gradients are asked for by the adjoint method"
     if max(len(spec.field), len(spec.decoder)) > _MOST_LAYERS + 1:
         return f"a perceptron has more than {_MOST_LAYERS} layers"
-    if state.device.type != "cpu" or state.dtype not in _TYPES:
-        return f"the state is {state.dtype} on {state.device}, not float32 or float64 on the CPU"
-    trained, known = tuple(weights.tensors()), tuple(rows.known())
+    if device.type != "cpu" or dtype not in _TYPES:
+        return f"the state is {dtype} on {device}, not float32 or float64 on the CPU"
+    return None
+
+
+def unsupported(
+    spec: ScanSpec, parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor
+) -> str | None:
+    """None where the compiled backend runs a scan, else the reason why not."""
+    if reason := supports(spec, state.dtype, state.device):
+        return reason
+    trained, given = tuple(parts.tensors()), tuple(inputs.known())
     if not trained:
-        return "it has no weights"
-    if any(t.dtype != state.dtype or t.device != state.device for t in (*trained, *known)):
-        return "weights, rows and state differ in type or device"
-    if any(t.requires_grad for t in known):
-        return "a gradient is asked for of what is known of a row"
-    return ""
+        return "it has no trained parts"
+    if any(t.dtype != state.dtype or t.device != state.device for t in (*trained, *given)):
+        return "trained parts, inputs and state differ in type or device"
+    if any(t.requires_grad for t in given):
+        return "a gradient with respect to the step inputs is asked for"
+    return None
 
 
 def scan(
     spec: ScanSpec,
-    weights: ScanWeights,
-    rows: StepInputs | TableSteps,
+    parts: ScanParts,
+    inputs: StepInputs | TableSteps,
     state: Tensor,
-    body: str | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Carries a batch of states over all rows, as `offbeat.kernels.scan`.
+    variant: str | None = None,
+) -> tuple[Tensor, Tensor] | None:
+    """Moves a batch of states over all steps, as `offbeat.kernels.scan`.
 
     Args:
         spec: see there.
-        weights: see there.
-        rows: see there.
+        parts: see there.
+        inputs: see there.
         state: see there.
-        body: name of a compiled backend; by default the best one.
+        variant: name of an instruction set; by default the best one.
 
     Raises:
-        RuntimeError: the compiled backend can't run this scan.
+        RuntimeError: this backend cannot run this scan.
         ValueError: shapes disagree.
     """
-    reason = unsupported(spec, weights, rows, state)
-    if reason:
-        raise RuntimeError(f"the compiled backend can't run this scan: {reason}")
+    if reason := unsupported(spec, parts, inputs, state):
+        raise RuntimeError(f"the cpu backend cannot run this scan: {reason}")
     result = _Scan.apply(  # type: ignore[no-untyped-call]
-        spec, rows, body or instruction_sets()[0], torch.is_grad_enabled(), weights.packed(), state
+        spec,
+        inputs,
+        variant or instruction_sets()[0],
+        torch.is_grad_enabled(),
+        parts.packed(),
+        state,
     )
     return cast("tuple[Tensor, Tensor]", result)
 
@@ -155,7 +171,7 @@ def compiled_spec(spec: ScanSpec) -> Any:
         channels=spec.channels,
         hidden=spec.hidden_size,
         anchored=spec.anchors,
-        time_inputs=spec.ages,
+        time_inputs=spec.time_inputs,
         cell=_CELLS[spec.cell],
         reset_after=spec.reset_after,
         field=list(spec.field),

@@ -1,11 +1,11 @@
-"""The reference backend of the scan, in PyTorch: the loop over rows, written once.
+"""The reference backend of the scan, in PyTorch: the loop over steps, written once.
 
-decay -> flow over the gap -> (predictions are read here) -> cell at an observation
+decay -> dynamics over the gap -> (predictions are read here) -> cell at an observation
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,45 +15,59 @@ from torch.nn.functional import linear, silu
 from offbeat.kernels.spec import (
     LARGEST_EXPONENT,
     Layers,
+    ScanCell,
+    ScanParts,
     ScanSpec,
-    ScanWeights,
     StepInputs,
+    field_tensors,
 )
 from offbeat.ode import Field, solve, tableau
 
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"tanh": torch.tanh, "silu": silu}
+"""Nonlinearities by name."""
+
 
 def scan(
-    spec: ScanSpec, weights: ScanWeights, rows: StepInputs, state: Tensor
+    spec: ScanSpec, parts: ScanParts, inputs: StepInputs, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Carries a batch of states over all rows; every combination, as `offbeat.kernels.scan`."""
+    """Moves a batch of states over all steps; every combination, as `offbeat.kernels.scan`."""
     before: list[Tensor] = []
     after: list[Tensor] = []
-    decays = _decays(spec, weights, rows)
-    gates = _gates(spec, weights, rows)
-    gaps, updates = rows.gap[..., None].unbind(1), rows.update[..., None].unbind(1)
-    shortest = rows.rows if rows.length is None else int(rows.length.min())
+    decays = _decays(spec, parts, inputs)
+    gates = _gates(spec, parts, inputs)
+    gaps, updates = inputs.gap[..., None].unbind(1), inputs.update[..., None].unbind(1)
+    shortest = inputs.rows if inputs.length is None else int(inputs.length.min())
     for i, (gap, update, decay) in enumerate(zip(gaps, updates, decays, strict=True)):
         old = state
         gate = gates[:, i] if gates is not None else None
-        if rows.fed and rows.fed[i]:
-            gate = _fed_gate(spec, weights, rows, state, i)
-        state = _carry(spec, weights, gap, decay, state)
-        alive = None
-        if i >= shortest and rows.length is not None:
-            alive = (rows.length > i)[:, None]
-            state = torch.where(alive, state, old)
+        if inputs.fed and inputs.fed[i]:
+            gate = _fed_gate(spec, parts, inputs, state, i)
+        state = _propagate(spec, parts, gap, decay, state)
+        valid = None
+        if i >= shortest and inputs.length is not None:
+            valid = (inputs.length > i)[:, None]
+            state = torch.where(valid, state, old)
         before.append(state)
-        if spec.cell != "none" and gate is not None:
-            observed = (rows.values[:, i], rows.mask[:, i]) if spec.anchored else None
-            updated = _update(spec, weights, gate, update, observed, state)
-            state = updated if alive is None else torch.where(alive, updated, state)
+        if parts.cell is not None and gate is not None:
+            observed = (inputs.values[:, i], inputs.mask[:, i]) if spec.anchored else None
+            updated = _update(spec, parts.cell, gate, update, observed, state)
+            state = updated if valid is None else torch.where(valid, updated, state)
         after.append(state)
     return torch.stack(before, dim=1), torch.stack(after, dim=1)
 
 
 def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
-    """Applies linear layers with a nonlinearity between them, none after the last."""
-    nonlinearity = torch.tanh if activation == "tanh" else silu
+    """Applies linear layers with a nonlinearity between them, none after the last.
+
+    Args:
+        layers: weights and biases.
+        x: (..., inputs).
+        activation: name of the nonlinearity.
+
+    Returns:
+        (..., outputs).
+    """
+    nonlinearity = ACTIVATIONS[activation]
     for i, (weight, bias) in enumerate(layers):
         x = linear(x, weight, bias)
         if i < len(layers) - 1:
@@ -61,34 +75,33 @@ def perceptron(layers: Layers, x: Tensor, activation: str) -> Tensor:
     return x
 
 
-# --- what does not depend on the state: for all rows at once --------------------------------------
+# --- what does not depend on the state: for all steps at once -------------------------------------
 
 
-def _gates(spec: ScanSpec, weights: ScanWeights, rows: StepInputs) -> Tensor | None:
+def _gates(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Tensor | None:
     """(batch, rows, gates) input projection of the cell."""
-    if spec.cell == "none":
+    if parts.cell is None:
         return None
-    shown = rows.values
-    if spec.input_decay:
-        shown = _faded(weights, rows)
-    return linear(_input(rows, shown, slice(None)), _given(weights.inputs), weights.bias)
+    shown = _decayed(parts, inputs) if spec.input_decay else inputs.values
+    return parts.cell.project(_input(inputs, shown, slice(None)))
 
 
-def _input(rows: StepInputs, shown: Tensor, at: slice | int) -> Tensor:
-    parts = [shown, rows.mask[:, at]]
-    if rows.age is not None:
-        parts.append(rows.age[:, at])
-    return torch.cat(parts, dim=-1)
+def _input(inputs: StepInputs, shown: Tensor, at: slice | int) -> Tensor:
+    each = [shown, inputs.mask[:, at]]
+    if inputs.time_input is not None:
+        each.append(inputs.time_input[:, at])
+    return torch.cat(each, dim=-1)
 
 
-def _faded(weights: ScanWeights, rows: StepInputs) -> Tensor:
+def _decayed(parts: ScanParts, inputs: StepInputs) -> Tensor:
     """x-hat of equation 27: the observed value, or what is left of the last one."""
-    if weights.input_decay is None:
-        raise ValueError("input_decay needs ScanWeights.input_decay")
-    weight, bias = weights.input_decay
-    mean = _given(rows.mean)
-    gamma = torch.exp(-(weight * _given(rows.delta) + bias).clamp_min(0))
-    return torch.where(rows.mask > 0, rows.values, gamma * _given(rows.last) + (1 - gamma) * mean)
+    if parts.input_decay is None:
+        raise ValueError("input_decay needs ScanParts.input_decay")
+    weight, bias = parts.input_decay
+    mean = _given(inputs.mean)
+    gamma = torch.exp(-(weight * _given(inputs.delta) + bias).clamp_min(0.0))
+    x_hat = gamma * _given(inputs.last) + (1 - gamma) * mean
+    return torch.where(inputs.mask > 0, inputs.values, x_hat)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,21 +125,21 @@ Decay = Tensor | DecayAlongGap | None
 """Of one row: the factor of h, or the exponents where they act step by step, or nothing."""
 
 
-def _decays(spec: ScanSpec, weights: ScanWeights, rows: StepInputs) -> Sequence[Decay]:
+def _decays(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Sequence[Decay]:
     """The decay of each row; where it acts at once, the factors of all rows in one go."""
     if not spec.decay:
-        return [None] * rows.rows
-    if weights.decay is None:
-        raise ValueError("a decay needs ScanWeights.decay")
-    end = linear(_given(rows.decay_end), *weights.decay)
+        return [None] * inputs.rows
+    if parts.decay is None:
+        raise ValueError("a decay needs ScanParts.decay")
+    end = linear(_given(inputs.decay_end), *parts.decay)
     if spec.decay_rows == "continuous":
-        start = linear(_given(rows.decay_start), *weights.decay)
-        fresh = _given(rows.updated)[..., None] > 0
-        applied = torch.where(fresh, 0.0, start.clamp(0, LARGEST_EXPONENT))
+        start = linear(_given(inputs.decay_start), *parts.decay)
+        fresh = _given(inputs.updated)[..., None] > 0
+        applied = torch.where(fresh, 0.0, start.clamp(0.0, LARGEST_EXPONENT))
     else:
-        # The whole exponent again: at each row it compounds over hidden ones.
+        # The whole exponent again: at each step it compounds over unobserved ones.
         if spec.decay_rows == "observed_rows":
-            end = end * rows.update[..., None]
+            end = end * inputs.update[..., None]
         start, applied = end, torch.zeros_like(end)
     several_steps = spec.steps_per_gap > 1 or spec.max_step is not None
     if spec.field and (several_steps or tableau(spec.solver).adaptive):
@@ -139,25 +152,26 @@ def _decays(spec: ScanSpec, weights: ScanWeights, rows: StepInputs) -> Sequence[
 
 def _given(tensor: Tensor | None) -> Tensor:
     if tensor is None:
-        raise ValueError("the scan's rows or weights lack what its spec asks for")
+        raise ValueError("the scan's inputs or parts lack what its spec asks for")
     return tensor
 
 
 def _fed_gate(
-    spec: ScanSpec, weights: ScanWeights, rows: StepInputs, state: Tensor, i: int
+    spec: ScanSpec, parts: ScanParts, inputs: StepInputs, state: Tensor, i: int
 ) -> Tensor:
+    assert parts.cell is not None
     hidden = state[:, spec.anchors : spec.anchors + spec.hidden_size]
-    decoded = perceptron(weights.decoder, hidden, "tanh")
-    return linear(_input(rows, decoded, i), _given(weights.inputs), weights.bias)
+    decoded = perceptron(parts.decoder, hidden, "tanh")
+    return parts.cell.project(_input(inputs, decoded, i))
 
 
 # --- over the gap ---------------------------------------------------------------------------------
 
 
-def _carry(
-    spec: ScanSpec, weights: ScanWeights, gap: Tensor, decay: Decay, state: Tensor
+def _propagate(
+    spec: ScanSpec, parts: ScanParts, gap: Tensor, decay: Decay, state: Tensor
 ) -> Tensor:
-    """Decay and flow of (x, h) over one gap; the memory of an LSTM stays."""
+    """Decay and dynamics of (x, h) over one gap; the memory of a cell stays."""
     if isinstance(decay, Tensor):
         state = _scale_hidden(spec, state, decay)
         decay = None
@@ -166,29 +180,33 @@ def _carry(
     driven = spec.anchors + spec.hidden_size
     memory = state[:, driven:]
     state = state[:, :driven]
-    state = _flow(spec, weights, gap, decay, state)
+    state = _solve(spec, parts, gap, decay, state)
     return torch.cat([state, memory], dim=1) if memory.shape[1] else state
 
 
-def _flow(
+def _solve(
     spec: ScanSpec,
-    weights: ScanWeights,
+    parts: ScanParts,
     gap: Tensor,
     decay: DecayAlongGap | None,
     state: Tensor,
 ) -> Tensor:
+    vector_field = parts.field
+    if vector_field is None:
+        raise ValueError("a vector field needs ScanParts.field")
+
     def field(_: Tensor, y: Tensor) -> Tensor:
-        return perceptron(weights.field, y, spec.activation)
+        return vector_field(y)
 
     scheme = tableau(spec.solver)
-    parameters = [p for layer in weights.field for p in layer] if spec.adjoint else None
+    parameters = list(field_tensors(vector_field)) if spec.adjoint else None
     if scheme.adaptive and decay is not None:
-        return _flow_damped(spec, field, parameters, gap, decay, state)
+        return _solve_damped(spec, field, parameters, gap, decay, state)
     steps: int | Tensor = spec.steps_per_gap
     if spec.max_step is not None:
         steps = torch.ceil(gap / spec.max_step - 1e-6).clamp_min(spec.steps_per_gap).long()
     if decay is not None:
-        return _flow_split(spec, field, parameters, gap, decay, state, steps)
+        return _solve_split(spec, field, parameters, gap, decay, state, steps)
     return solve(
         field,
         state,
@@ -201,7 +219,7 @@ def _flow(
     )
 
 
-def _flow_split(
+def _solve_split(
     spec: ScanSpec,
     field: Field,
     parameters: Sequence[Tensor] | None,
@@ -217,8 +235,8 @@ def _flow_split(
     start, end, applied = decay.start, decay.end, decay.applied
     most = steps if isinstance(steps, int) else int(steps.max())
     for k in range(1, most + 1):
-        share = k / steps if isinstance(steps, int) else (k / steps.to(gap)).clamp_max(1.0)
-        reached = start + share * (end - start)
+        part = k / steps if isinstance(steps, int) else (k / steps.to(gap)).clamp_max(1.0)
+        reached = start + part * (end - start)
         state = _scale_hidden(spec, state, torch.exp(-_growth(reached, applied)))
         applied = torch.maximum(applied, _exponent(reached))
         step = gap / steps
@@ -228,7 +246,7 @@ def _flow_split(
     return state
 
 
-def _flow_damped(
+def _solve_damped(
     spec: ScanSpec,
     field: Field,
     parameters: Sequence[Tensor] | None,
@@ -265,7 +283,7 @@ def _flow_damped(
 
 def _exponent(a: Tensor) -> Tensor:
     """A of `DecayAlongGap`, bounded."""
-    return a.clamp(0, LARGEST_EXPONENT)
+    return a.clamp(0.0, LARGEST_EXPONENT)
 
 
 def _growth(a: Tensor, applied: Tensor) -> Tensor:
@@ -273,7 +291,7 @@ def _growth(a: Tensor, applied: Tensor) -> Tensor:
 
     A decay only ever shrinks: a state that the flow has meanwhile moved is not blown up again.
     """
-    return (_exponent(a) - applied).clamp_min(0)
+    return (_exponent(a) - applied).clamp_min(0.0)
 
 
 def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
@@ -290,45 +308,18 @@ def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
 
 def _update(
     spec: ScanSpec,
-    weights: ScanWeights,
+    cell: ScanCell,
     gate: Tensor,
     update: Tensor,
     observed: tuple[Tensor, Tensor] | None,
     state: Tensor,
 ) -> Tensor:
+    """The state after an observation; of an anchored one, x takes the observed values."""
     if observed is None:
-        return _cell(spec, weights, gate, update, state)
+        return cell.step(gate, state, update)
     x, rest = state[:, : spec.anchors], state[:, spec.anchors :]
     value, mask = observed
-    if weights.innovation is not None:
-        gate = torch.addmm(gate, mask * (value - x), weights.innovation.t())
-    rest = _cell(spec, weights, gate, update, rest)
+    if cell.innovation is not None:
+        gate = torch.addmm(gate, mask * (value - x), cell.innovation.t())
+    rest = cell.step(gate, rest, update)
     return torch.cat([torch.lerp(x, value, mask), rest], dim=1)
-
-
-def _cell(
-    spec: ScanSpec, weights: ScanWeights, gate: Tensor, update: Tensor, state: Tensor
-) -> Tensor:
-    """The new (h, c) where `update` is 1; exactly the old one where it is 0."""
-    if spec.cell == "set":
-        return torch.lerp(state, gate, update)
-    if weights.recurrent is None:
-        raise ValueError(f"the cell {spec.cell!r} needs ScanWeights.recurrent")
-    n = spec.hidden_size
-    h = state[:, :n]
-    recurrent = weights.recurrent
-    if spec.cell == "elman":  # equation 6
-        return torch.lerp(h, torch.tanh(torch.addmm(gate, h, recurrent.t())), update)
-    if spec.cell == "lstm":  # equations 14-19
-        forget, insert, node, output = torch.addmm(gate, h, recurrent.t()).chunk(4, dim=1)
-        c = torch.sigmoid(forget) * state[:, n:] + torch.sigmoid(insert) * torch.tanh(node)
-        new = torch.cat([torch.sigmoid(output) * torch.tanh(c), c], dim=1)
-        return torch.lerp(state, new, update)
-    # equations 20-23, and 29-32 with the gates of GRU-D
-    z, r = torch.sigmoid(torch.addmm(gate[:, : 2 * n], h, recurrent[: 2 * n].t())).chunk(2, dim=1)
-    if spec.reset_after:
-        product = torch.addmm(_given(weights.recurrent_bias), h, recurrent[2 * n :].t())
-        candidate = torch.tanh(gate[:, 2 * n :] + r * product)
-    else:
-        candidate = torch.tanh(torch.addmm(gate[:, 2 * n :], r * h, recurrent[2 * n :].t()))
-    return torch.lerp(h, candidate, z * update)

@@ -1,12 +1,13 @@
-"""What a scan consists of: its shape, its weights, and one record of what is known of each row.
+"""What a scan consists of: its shape, its trained parts, and the inputs of each step.
 
-A scan carries a state over rows. The facts of a row (`StepInputs`) follow from times, masks and
-values alone; no weight has touched them, so they are made once for a data set. Everything that a
-weight touches happens inside the scan: what does not depend on the state (input projection, decay
-exponents, x-hat), and what does (innovation, self-feeding, vector field, recurrent product).
+A scan moves a state over time steps. The inputs of a step (`StepInputs`) follow from times, masks
+and values alone. They do not depend on trained parameters, so they are computed once per data set.
+Everything that a parameter touches happens inside the scan: what does not depend on the state (the
+projection of the inputs, decay exponents, x-hat), and what does (innovation, self-feeding, vector
+field, recurrent product).
 
 The state of one trajectory is `[x | h | c]`: `anchored` channels, `hidden_size` hidden units, and
-as many memory units when the cell is an LSTM.
+`memory` further units, which an LSTM needs.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -30,35 +31,41 @@ class ScanSpec:
     Attributes:
         channels: width of the observed values.
         hidden_size: units of h.
-        anchored: the channels are held inside the state, and an observation sets them.
-        cell: `gru`, `elman`, `lstm`, `set` (h becomes the input's projection, a start value) or
-            `none`.
+        cell: name of the cell in `parts.CELLS`, such as `gru`; `none` without one.
+        gates: width of the cell's input projection.
+        memory: units of c, beside those of h.
+        anchored: the channels are part of the state, and an observation sets them.
         reset_after: the GRU's reset gate acts after the recurrent product.
-        ages: width of what tells the cell how old its knowledge is; 0 for nothing.
-        field: units of each layer of the vector field, ends included; empty without one.
+        time_inputs: width of the times since observation that the cell is given; 0 for none.
+        field: units of each layer of a perceptron vector field, ends included. A field of another
+            kind has its name in `field_kind`, and here its ends alone. Empty without a field.
+        field_kind: name of the vector field in `parts.FIELDS`.
         activation: nonlinearity between the layers of the vector field.
         solver: name of a tableau.
         steps_per_gap: least number of equal steps of a fixed-step solver over one gap.
         max_step: longest such step, model time; None for no bound.
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver.
-        adjoint: gradients of the flow by the adjoint method.
-        decay: width of what the decay of h is made from: 0 without one, else the ages of all
-            channels (equation 26) or one elapsed time (equation 42).
-        decay_rows: meaning of a row in which nothing is observed: `continuous`, the exponent grows
-            along time; `every_row`, it acts again at each row; `observed_rows`, only where the
+        adjoint: gradients of the vector field's solution by the adjoint method.
+        decay: width of what the decay of h is computed from: 0 without one, else the times since
+            observation of all channels (equation 26) or one elapsed time (equation 42).
+        decay_rows: meaning of a step in which nothing is observed: `continuous`, the exponent grows
+            along time; `every_row`, it acts again at each step; `observed_rows`, only where the
             cell acts.
-        input_decay: last values fade to the mean (equation 27).
+        input_decay: last values decay to the mean (equation 27).
         decoder: units of each layer of the decoder, ends included, with self-feeding only.
     """
 
     channels: int
     hidden_size: int
+    cell: str = "gru"
+    gates: int = 0
+    memory: int = 0
     anchored: bool = False
-    cell: Literal["none", "set", "elman", "lstm", "gru"] = "gru"
     reset_after: bool = False
-    ages: int = 0
+    time_inputs: int = 0
     field: tuple[int, ...] = ()
+    field_kind: str = "mlp"
     activation: Literal["tanh", "silu"] = "tanh"
     solver: str = "euler"
     steps_per_gap: int = 1
@@ -72,76 +79,90 @@ class ScanSpec:
     decoder: tuple[int, ...] = ()
 
     @property
-    def gates(self) -> int:
-        """Width of the cell's input projection."""
-        factor = {"none": 0, "set": 1, "elman": 1, "lstm": 4, "gru": 3}[self.cell]
-        return factor * self.hidden_size
-
-    @property
     def anchors(self) -> int:
-        """Channels held inside the state."""
+        """Channels that are part of the state."""
         return self.channels if self.anchored else 0
 
     @property
     def state_size(self) -> int:
         """Units of the whole state."""
-        memory = self.hidden_size if self.cell == "lstm" else 0
-        return self.anchors + self.hidden_size + memory
+        return self.anchors + self.hidden_size + self.memory
 
 
 Layers = tuple[tuple[Tensor, Tensor], ...]
 """Weight (out, in) and bias (out,) of each layer of a perceptron."""
 
 
-@dataclass(frozen=True, eq=False)
-class ScanWeights:
-    """The weights of a scan.
+class ScanCell(Protocol):
+    """What a scan needs of a cell; `parts.cells.Cell` is the base class that has it."""
 
-    Gate order: GRU update, reset, candidate; LSTM forget, input, node, output.
+    @property
+    def innovation(self) -> Tensor | None:
+        """(gates, channels) weights of the innovation of an anchored state, or None."""
+
+    def project(self, inputs: Tensor) -> Tensor:
+        """(..., inputs) to (..., gates): all that does not depend on the state."""
+
+    def step(self, gates: Tensor, state: Tensor, update: Tensor) -> Tensor:
+        """The new (h, c) of each row where `update` is 1, exactly the old one where it is 0."""
+
+    def tensors(self) -> Iterator[Tensor]:
+        """All trained tensors, in the order of the packed buffer."""
+
+
+class ScanField(Protocol):
+    """What a scan needs of a vector field."""
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """(..., state) to its derivative, of the same shape."""
+
+    def parameters(self) -> Iterator[Any]:
+        """All trained tensors."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScanParts:
+    """The trained parts of a scan.
 
     Attributes:
-        inputs: (gates, 2 channels + ages) of values, mask and ages; None without a cell.
-        bias: (gates,).
-        recurrent: (gates, hidden); None without a recurrent cell.
-        recurrent_bias: (hidden,) inside the reset product, with `reset_after` only.
-        innovation: (gates, channels), with an anchored state only.
+        cell: what an observation does to h; None without one.
         decay: weight (hidden, decay) and bias (hidden,) of the exponents, or None.
         input_decay: weight (channels,) and bias (channels,) of gamma_x, or None.
-        field: layers of the vector field; empty without one.
+        field: the vector field, or None.
         decoder: layers of the decoder, with self-feeding only.
     """
 
-    inputs: Tensor | None = None
-    bias: Tensor | None = None
-    recurrent: Tensor | None = None
-    recurrent_bias: Tensor | None = None
-    innovation: Tensor | None = None
+    cell: ScanCell | None = None
     decay: tuple[Tensor, Tensor] | None = None
     input_decay: tuple[Tensor, Tensor] | None = None
-    field: Layers = ()
+    field: ScanField | None = None
     decoder: Layers = ()
 
     def tensors(self) -> Iterator[Tensor]:
-        """All weights that there are, in the order of the packed buffer."""
-        for tensor in (
-            self.inputs,
-            self.bias,
-            self.recurrent,
-            self.recurrent_bias,
-            self.innovation,
-        ):
-            if tensor is not None:
-                yield tensor
+        """All trained tensors, in the order of the packed buffer."""
+        if self.cell is not None:
+            yield from self.cell.tensors()
         for pair in (self.decay, self.input_decay):
             if pair is not None:
                 yield from pair
-        for layers in (self.field, self.decoder):
-            for layer in layers:
-                yield from layer
+        if self.field is not None:
+            yield from field_tensors(self.field)
+        for layer in self.decoder:
+            yield from layer
 
     def packed(self) -> Tensor:
-        """All weights in one flat buffer; gradients flow through."""
+        """All trained tensors in one flat buffer; gradients flow through."""
         return torch.cat([tensor.reshape(-1) for tensor in self.tensors()])
+
+
+def field_tensors(field: ScanField) -> Iterator[Tensor]:
+    """All trained tensors of a vector field; those of a perceptron layer by layer."""
+    layers = getattr(field, "layers", None)
+    if layers is None:
+        yield from field.parameters()
+        return
+    for layer in layers:
+        yield from layer
 
 
 QUANTITIES = (
@@ -150,32 +171,32 @@ QUANTITIES = (
     "updated",
     "values",
     "mask",
-    "age",
+    "time_input",
     "decay_start",
     "decay_end",
     "delta",
     "last",
 )
-"""What can be known of each row of each trajectory, in the order of the compiled code."""
+"""What can be given of each step of each trajectory, in the order of the compiled code."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """What is known of each row; no weight has touched it.
+    """What is given of each step; it does not depend on trained parameters.
 
     Attributes:
-        gap: (batch, rows) model time since the row before, saturated.
+        gap: (batch, rows) model time since the step before, saturated.
         update: (batch, rows) 1.0 where the cell acts, else 0.0.
         values: (batch, rows, channels) observed values, 0 elsewhere.
         mask: (batch, rows, channels) 1.0 where observed, else 0.0.
-        age: (batch, rows, ages) how old the cell's knowledge is, or None.
-        updated: (batch, rows) 1.0 where the cell acted at the row before; with a decay only.
-        decay_start: (batch, rows, decay) what the decay is made from, at the start of the gap.
+        time_input: (batch, rows, time_inputs) times since observation for the cell, or None.
+        updated: (batch, rows) 1.0 where the cell acted at the step before; with a decay only.
+        decay_start: (batch, rows, decay) what the decay is computed from, at the start of the gap.
         decay_end: (batch, rows, decay) the same at its end.
-        delta: (batch, rows, channels) model time since each channel's last observation; with
+        delta: (batch, rows, channels) model time since each channel's last observation, with
             `input_decay` only.
         last: (batch, rows, channels) last value of each channel; with `input_decay` only.
-        mean: (channels,) what a value fades to; with `input_decay` only.
+        mean: (channels,) what a value decays to; with `input_decay` only.
         length: (batch,) int64, rows of each trajectory; later rows are padding and leave the state
             as it is. None: all rows count.
         fed: one bool per row, True where the decoded state stands for the observed values; with
@@ -186,7 +207,7 @@ class StepInputs:
     update: Tensor
     values: Tensor
     mask: Tensor
-    age: Tensor | None = None
+    time_input: Tensor | None = None
     updated: Tensor | None = None
     decay_start: Tensor | None = None
     decay_end: Tensor | None = None
@@ -205,23 +226,23 @@ class StepInputs:
         return self.gap.shape[1]
 
     def gathered(self) -> StepInputs:
-        """These rows; `TableSteps` has them in a table."""
+        """These inputs; `TableSteps` has them in a table."""
         return self
 
     def known(self) -> Iterator[Tensor]:
         """All tensors of numbers that there are."""
-        for fact in QUANTITIES:
-            if (tensor := getattr(self, fact)) is not None:
+        for name in QUANTITIES:
+            if (tensor := getattr(self, name)) is not None:
                 yield tensor
 
 
 @dataclass(frozen=True, eq=False)
 class StepTable:
-    """The facts of many trajectories side by side in one tensor, so that a batch is one gather.
+    """The step inputs of many trajectories in one tensor, so that a batch is one gather.
 
     Attributes:
         table: (trajectories, rows, columns), the columns in one piece.
-        places: of each fact: its name, its columns, and whether it has an axis of units.
+        places: of each input: its name, its columns, and whether it has an axis of units.
         mean: as `StepInputs.mean`.
         length: as `StepInputs.length`.
     """
@@ -233,17 +254,17 @@ class StepTable:
 
     @classmethod
     def of(cls, rows: StepInputs) -> StepTable:
-        """Puts facts side by side.
+        """Puts step inputs side by side.
 
         Args:
             rows: of all trajectories.
         """
-        facts = {name: getattr(rows, name) for name in QUANTITIES}
+        given = {name: getattr(rows, name) for name in QUANTITIES}
         places, columns, known, width = [], [], {}, 0
-        for name, value in facts.items():
+        for name, value in given.items():
             if value is None:
                 continue
-            if id(value) not in known:  # one tensor may stand for two facts
+            if id(value) not in known:  # one tensor may stand for two inputs
                 column = value if value.ndim == 3 else value[..., None]
                 known[id(value)] = slice(width, width + column.shape[2])
                 columns.append(column)
@@ -273,7 +294,7 @@ class StepTable:
 
 @dataclass(frozen=True, eq=False)
 class TableSteps:
-    """Rows that lie in a table: the compiled backend reads them there, others have them gathered.
+    """Step inputs in a table: a compiled backend reads them there, others gather them.
 
     Attributes:
         table: has the rows.
@@ -295,11 +316,11 @@ class TableSteps:
     def gathered(self) -> StepInputs:
         """The rows, side by side."""
         table = self.table.table[:, : self.rows].index_select(0, self.index)
-        facts: dict[str, Any] = {
+        given: dict[str, Any] = {
             name: table[..., at] if units else table[..., at.start]
             for name, at, units in self.table.places
         }
-        return StepInputs(**facts, mean=self.table.mean, length=self.length, fed=self.fed)
+        return StepInputs(**given, mean=self.table.mean, length=self.length, fed=self.fed)
 
     def known(self) -> Iterator[Tensor]:
         """All tensors of numbers that there are."""

@@ -13,47 +13,60 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as dump_tensors
 from torch import Tensor
 
-from offbeat.config import ModelConfig, from_mapping
+from offbeat.data.batch import STATE
 from offbeat.data.scaler import Scaler
-from offbeat.errors import FileFormatError
+from offbeat.data.transforms import Transforms
+from offbeat.errors import FileFormatError, InputError
 from offbeat.files import atomic_folder
+from offbeat.models.base import BaseModel, DataInfo
+from offbeat.models.foreign import ForeignModel
 from offbeat.models.model import Model
 from offbeat.models.statistics import Statistics
+from offbeat.models.zoo import MODELS, build
 
 FORMAT = "offbeat-checkpoint"
-VERSION = 1
+VERSION = 2
 TENSORS = "model.safetensors"
 CONFIG = "config.json"
 
 
-def save_model(model: Model, path: str | Path) -> None:
+def save_model(model: BaseModel, path: str | Path) -> None:
     """Writes a model to a folder, atomically; one that stood there is replaced.
 
     Args:
         model: weights, config, statistics, scaler, channel names and units are all saved.
         path: the folder.
     """
-    _write(path, _weights(model), _facts(model))
+    _write(path, _weights(model), _record(model))
 
 
-def load_model(path: str | Path) -> Model:
+def load_model(path: str | Path) -> Any:
     """Reads a model back: the same predictions, bit for bit.
 
     Args:
         path: the folder of a checkpoint, one of a training that goes on included, or of a run
             that `fit` wrote.
 
+    Returns:
+        A `Model`, or a `ForeignModel`.
+
     Raises:
         FileFormatError: the folder is missing, damaged by as little as one byte, not a checkpoint,
             or of a newer version.
+        InputError: it is a model of another package, which has not been registered.
     """
     path = Path(path)
     if not (path / CONFIG).is_file() and (path / "model" / CONFIG).is_file():
         path = path / "model"
-    tensors, facts = _read(path)
+    tensors, record = _read(path)
+    if "name" not in record["model"] and record["name"] not in MODELS:
+        raise InputError(
+            f"{path} holds the model {record['name']!r} of another package, which is not "
+            "registered here; import that package, or call offbeat.register_model, before loading"
+        )
     try:
-        model = _build(facts)
-        if facts["dtype"] == "float64":
+        model = _build(record)
+        if record["dtype"] == "float64":
             model.double()
         weights = {k: v for k, v in tensors.items() if not k.startswith("training.")}
         model.load_state_dict(weights)
@@ -63,74 +76,111 @@ def load_model(path: str | Path) -> Model:
 
 
 def save_training_state(
-    model: Model, tensors: dict[str, Tensor], facts: dict[str, Any], path: str | Path
+    model: BaseModel, tensors: dict[str, Tensor], record: dict[str, Any], path: str | Path
 ) -> None:
     """Writes a model with all that its training needs to go on.
 
     Args:
         model: as it stands.
         tensors: of the optimizer, and best weights.
-        facts: JSON-like counters and history.
+        record: JSON-like counters and history.
         path: the folder.
     """
     everything = {**_weights(model), **{f"training.{k}": v for k, v in tensors.items()}}
-    _write(path, everything, {**_facts(model), "training": facts})
+    _write(path, everything, {**_record(model), "training": record})
 
 
 def load_training_state(
     path: str | Path,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
-    """Reads what `save_training_state` wrote: weights, training tensors, facts.
+    """Reads what `save_training_state` wrote: weights, training tensors, record.
 
     Raises:
         FileFormatError: as `load_model`.
     """
-    tensors, facts = _read(Path(path))
-    if "training" not in facts:
+    tensors, record = _read(Path(path))
+    if "training" not in record:
         raise FileFormatError(f"{path} holds a model without the state of its training")
     weights = {k: v for k, v in tensors.items() if not k.startswith("training.")}
     training = {
         k.removeprefix("training."): v for k, v in tensors.items() if k.startswith("training.")
     }
-    return weights, training, facts["training"]
+    return weights, training, record["training"]
 
 
-def _weights(model: Model) -> dict[str, Tensor]:
+def _weights(model: BaseModel) -> dict[str, Tensor]:
     return {k: v.detach().cpu().clone() for k, v in model.state_dict().items()}
 
 
-def _facts(model: Model) -> dict[str, Any]:
+def _record(model: BaseModel) -> dict[str, Any]:
+    config: dict[str, Any] = {}
+    if isinstance(model, Model):
+        config = asdict(model.config)
+    elif isinstance(model, ForeignModel):
+        config = model.options
     return {
         "format": FORMAT,
         "version": VERSION,
         "torch": torch.__version__,
         "dtype": str(model.dtype).removeprefix("torch."),
-        "model": asdict(model.config),
+        "name": model.name,
+        "model": config,
         "names": list(model.names),
         "units": list(model.units),
-        "time_unit_s": model.time_unit,
+        "roles": list(model.roles),
         "statistics": model.statistics.to_dict(),
         "scaler": model.scaler.to_dict(),
+        "transforms": model.transforms.to_dict(),
     }
 
 
-def _build(facts: dict[str, Any]) -> Model:
-    return Model(
-        from_mapping(ModelConfig, facts["model"]),
-        Statistics.from_dict(facts["statistics"]),
-        scaler=Scaler.from_dict(facts["scaler"]),
-        names=tuple(facts["names"]),
-        units=tuple(facts["units"]),
+def _build(record: dict[str, Any]) -> BaseModel:
+    data = DataInfo(
+        names=tuple(record["names"]),
+        units=tuple(record["units"]),
+        roles=tuple(record["roles"]),
+        scaler=Scaler.from_dict(record["scaler"]),
+        statistics=Statistics.from_dict(record["statistics"]),
+        transforms=Transforms.from_dict(record["transforms"]),
     )
+    return build(record["name"], record["model"], data)
 
 
-def _write(path: str | Path, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
+_RENAMED = {"age_input": "time_input", "age_unit": "time_input_unit"}
+"""Fields of `ModelConfig` by their names in version 1."""
+
+
+def _of_version_1(record: dict[str, Any]) -> dict[str, Any]:
+    """A record of version 1 in the form of version 2."""
+    config = {_RENAMED.get(key, key): value for key, value in record["model"].items()}
+    return {
+        **record,
+        "name": config["name"],
+        "model": {**config, "head": "point"},
+        "roles": [STATE] * len(record["names"]),
+        "transforms": Transforms.identity().to_dict(),
+    }
+
+
+def _renamed(name: str) -> str:
+    """The name of a tensor of version 1 in version 2."""
+    prefix, kept = ("training.", name.removeprefix("training."))
+    if name == kept:
+        prefix = ""
+    best = "best." if kept.startswith("best.") else ""
+    kept = kept.removeprefix(best)
+    if kept.startswith("decoder."):
+        kept = f"head.{kept}"
+    return f"{prefix}{best}{kept}"
+
+
+def _write(path: str | Path, tensors: dict[str, Tensor], record: dict[str, Any]) -> None:
     data = dump_tensors(tensors)
-    facts = {**facts, "tensors_sha256": hashlib.sha256(data).hexdigest()}
-    facts["config_sha256"] = _digest(facts)
+    record = {**record, "tensors_sha256": hashlib.sha256(data).hexdigest()}
+    record["config_sha256"] = _digest(record)
     with atomic_folder(path) as folder:
         (folder / TENSORS).write_bytes(data)
-        text = json.dumps(facts, indent=2, allow_nan=False)
+        text = json.dumps(record, indent=2, allow_nan=False)
         (folder / CONFIG).write_text(text + "\n", encoding="utf-8")
 
 
@@ -142,26 +192,30 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                 "by training, or its subfolder 'model'"
             )
     try:
-        facts = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+        record = json.loads((path / CONFIG).read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise FileFormatError(f"{path / CONFIG} is damaged ({error})") from None
-    if not isinstance(facts, dict) or facts.get("format") != FORMAT:
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise FileFormatError(
             f"{path / CONFIG} is not an Offbeat checkpoint (no format {FORMAT!r})"
         )
-    if facts.get("version") != VERSION:
+    if record.get("version") not in (1, VERSION):
         raise FileFormatError(
-            f"{path} is of checkpoint version {facts.get('version')!r}, this Offbeat reads "
-            f"version {VERSION}; use the Offbeat that wrote it, or a newer one"
+            f"{path} is of checkpoint version {record.get('version')!r}, this Offbeat reads "
+            f"versions 1 to {VERSION}; use the Offbeat that wrote it, or a newer one"
         )
-    if facts.pop("config_sha256", None) != _digest(facts):
+    if record.pop("config_sha256", None) != _digest(record):
         raise FileFormatError(f"{path / CONFIG} is damaged: its checksum does not match")
     data = (path / TENSORS).read_bytes()
-    if hashlib.sha256(data).hexdigest() != facts["tensors_sha256"]:
+    if hashlib.sha256(data).hexdigest() != record["tensors_sha256"]:
         raise FileFormatError(f"{path / TENSORS} is damaged: its checksum does not match")
-    return load_tensors(data), facts
+    tensors = load_tensors(data)
+    if record["version"] == 1:
+        tensors = {_renamed(name): tensor for name, tensor in tensors.items()}
+        record = _of_version_1(record)
+    return tensors, record
 
 
-def _digest(facts: dict[str, Any]) -> str:
-    text = json.dumps(facts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+def _digest(record: dict[str, Any]) -> str:
+    text = json.dumps(record, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -1,8 +1,8 @@
-"""ElapsedTimes and gaps at every row, and what carries them, with the state, to the rows that follow.
+"""Times since observation and gaps at every row, and the state that goes on to the rows after them.
 
 By default nothing moves before the first observation: the model's clock starts there. After it,
 time since the last observed row saturates at a limit, and a gap is the growth of that saturated
-time. So rows in which nothing is observed can stand anywhere and change nothing.
+time. So rows in which nothing is observed can be inserted anywhere without effect.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from offbeat.data.batch import Batch, last_index
 
 @dataclass(frozen=True, eq=False)
 class RecurrentState:
-    """Everything a model takes from the rows it has seen to the rows to come.
+    """Everything a model keeps of the rows it has seen.
 
     Attributes:
         state: (batch, state_size).
@@ -28,7 +28,9 @@ class RecurrentState:
         last: (batch, channels) last observed value of each channel; the training mean before.
         updated: (batch,) bool, True if the cell acted at the last row.
         rows: number of rows seen.
-        generator: generator of the generator of self-feeding, or None.
+        generator: of self-feeding, or None.
+        actions: (batch, channels) values of the last row in channels with the role `action`, NaN
+            elsewhere and where there was none; None for a model without such channels.
     """
 
     state: Tensor
@@ -40,6 +42,7 @@ class RecurrentState:
     updated: Tensor
     rows: int = 0
     generator: torch.Generator | None = None
+    actions: Tensor | None = None
 
     @classmethod
     def empty(
@@ -50,7 +53,7 @@ class RecurrentState:
         Args:
             state: (batch, state_size) the state before anything is observed.
             mean: (channels,) stands for a value never observed.
-            generator: generator of the generator of self-feeding.
+            generator: of self-feeding.
         """
         batch, device = len(state), state.device
 
@@ -81,7 +84,8 @@ class ElapsedTimes:
         gap: (batch, rows) growth of the saturated time since the last observed row.
         elapsed: (batch, rows) saturated time since the last observed row, on arrival at the row.
         elapsed_before: (batch, rows) the same at the row before, after its observation.
-        delta: (batch, rows, channels) age of each channel (equation 25) on arrival; over a gap it
+        delta: (batch, rows, channels) time since each channel's last observation (equation 25) on
+            arrival; over a gap it
             grows as long as `elapsed` does.
         delta_before: (batch, rows, channels) the same at the row before, after its observation.
         last: (batch, rows, channels) last value of each channel on arrival.
@@ -98,18 +102,18 @@ class ElapsedTimes:
     last: Tensor
 
 
-def ages(
+def elapsed_times(
     batch: Batch,
-    carry: RecurrentState,
+    past: RecurrentState,
     *,
     elapsed_limit: float,
     from_first_row: bool = False,
 ) -> tuple[ElapsedTimes, RecurrentState]:
-    """ElapsedTimes at each row of a batch that continues what `carry` has seen.
+    """Times at each row of a batch that continues what `past` has seen.
 
     Args:
         batch: rows to come, in order.
-        carry: what was seen before; its `state` and `updated` are passed on as they are.
+        past: what was seen before; its `state`, `updated` and `actions` are passed on.
         elapsed_limit: s, at which the time since the last observed row saturates.
         from_first_row: the clock starts at the first row, observed or not.
     """
@@ -119,16 +123,16 @@ def ages(
     index, row_index = last_index(mask), last_index(observed[..., None])[..., 0]
     spread = times[..., None].expand(index.shape)
 
-    channel_at = _pick(spread, index, carry.channel_at[:, None])
-    observed_at = _pick(times, row_index, carry.observed_at[:, None])
-    last = _pick(batch.values, index, carry.last[:, None])
-    before = torch.cat([carry.time[:, None], times[:, :-1]], dim=1)
+    channel_at = _pick(spread, index, past.channel_at[:, None])
+    observed_at = _pick(times, row_index, past.observed_at[:, None])
+    last = _pick(batch.values, index, past.last[:, None])
+    before = torch.cat([past.time[:, None], times[:, :-1]], dim=1)
     before = torch.where(before.isnan(), times, before)
 
     inf = float("inf")
     starts = batch.valid if from_first_row else observed
     earliest = torch.where(starts, times, inf).min(dim=1).values
-    start = torch.minimum(carry.start, earliest)
+    start = torch.minimum(past.start, earliest)
     clock = torch.maximum(observed_at, start[:, None])
     channel_clock = torch.maximum(channel_at, start[:, None, None])
     elapsed, lost = _saturate(times - clock, elapsed_limit)
@@ -137,7 +141,7 @@ def ages(
     delta_before = (before - lost_before)[..., None] - channel_clock
     result = ElapsedTimes(
         observed=observed,
-        first=observed & (row_index < 0) & carry.observed_at.isneginf()[:, None],
+        first=observed & (row_index < 0) & past.observed_at.isneginf()[:, None],
         step=times - before,
         gap=elapsed - elapsed_before,
         elapsed=elapsed,
@@ -146,18 +150,19 @@ def ages(
         delta_before=delta_before.clamp_min(0),
         last=last,
     )
-    carried = RecurrentState(
-        state=carry.state,
+    ended = RecurrentState(
+        state=past.state,
         time=times[:, -1],
         start=start,
         observed_at=torch.where(observed[:, -1], times[:, -1], observed_at[:, -1]),
         channel_at=torch.where(mask[:, -1], spread[:, -1], channel_at[:, -1]),
         last=torch.where(mask[:, -1], batch.values[:, -1], last[:, -1]),
-        updated=carry.updated,
-        rows=carry.rows + batch.rows,
-        generator=carry.generator,
+        updated=past.updated,
+        rows=past.rows + batch.rows,
+        generator=past.generator,
+        actions=past.actions,
     )
-    return result, carried
+    return result, ended
 
 
 def _saturate(elapsed: Tensor, limit: float) -> tuple[Tensor, Tensor]:

@@ -1,117 +1,119 @@
-"""The one model: a choice of parts around one scan.
+"""The recurrent model: a choice of parts around one scan.
 
-    decay -> flow over the gap -> cell at an observation -> readout
+    decay -> dynamics over the gap -> (read here: prediction from the past) -> cell -> (read here)
 
-`models.zoo` names the choices. Training, prediction and streaming all run `Model.forward`:
-a stream is the same call with one row and the `RecurrentState` of the rows before.
+`models.zoo` names the choices. Training, prediction and streaming all run `Model.forward`: a stream
+is the same call with one row and the `RecurrentState` of the rows before.
 """
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor, nn
 
 from offbeat.config import ModelConfig
-from offbeat.data.batch import Batch
-from offbeat.data.scaler import Scaler
-from offbeat.data.trajectory import Dataset
+from offbeat.data.batch import ACTION, Batch
 from offbeat.errors import InputError
-from offbeat.kernels import ScanSpec, ScanWeights, StepInputs, TableSteps, backend, cpu, scan
-from offbeat.models.elapsed import ElapsedTimes, RecurrentState, ages
-from offbeat.models.statistics import Statistics
+from offbeat.kernels import (
+    ScanParts,
+    ScanSpec,
+    StepInputs,
+    StepTable,
+    TableSteps,
+    choose,
+    scan,
+)
+from offbeat.models.base import BaseModel, DataInfo
+from offbeat.models.elapsed import ElapsedTimes, RecurrentState, elapsed_times
+from offbeat.parts import CELLS, FIELDS, HEADS, Cell, HeadShape, Perceptron, Prediction
 from offbeat.parts.decay import ExponentialDecay, InputDecay, TrainableDecay
-from offbeat.parts.perceptron import Cell, Perceptron, initialise
 
 
 @dataclass(frozen=True, eq=False)
-class Output:
-    """What a model says of a batch.
+class Output(Prediction):
+    """A prediction, and the states it was read from.
 
     Attributes:
-        predictions: (batch, rows, channels) scaled units; the value expected at each row, from
-            what was observed before it.
+        mean: (batch, rows, channels) scaled units; the value expected at each row.
+        scale: (batch, rows, channels) of heads that have one; else None.
         before: (batch, rows, state_size) state on arrival at each row.
         after: (batch, rows, state_size) state after each row.
-        carry: what goes on to the rows that follow.
+        past: what the rows that follow need; None from `run`.
     """
 
-    predictions: Tensor
-    before: Tensor
-    after: Tensor
-    carry: RecurrentState
+    before: Tensor | None = None
+    after: Tensor | None = None
+    past: RecurrentState | None = None
 
 
-class Model(nn.Module):
+class Model(BaseModel):
     """A recurrent model of unevenly sampled motion, composed of parts.
 
     Args:
         config: every field set; `zoo.make_model` fills in what a user leaves open.
-        statistics: measured on the training part.
-        scaler: maps original units to the scaled ones that the model works in.
-        names: channel names, which data must match.
-        units: channel units.
+        data: what it is made for.
         seed: of the initial weights.
 
     Raises:
         InputError: a field of the config is open, or parts do not fit together.
     """
 
-    def __init__(
-        self,
-        config: ModelConfig,
-        statistics: Statistics,
-        *,
-        scaler: Scaler,
-        names: tuple[str, ...],
-        units: tuple[str, ...],
-        seed: int = 0,
-    ) -> None:
-        super().__init__()
+    def __init__(self, config: ModelConfig, data: DataInfo, *, seed: int = 0) -> None:
+        super().__init__(config.name, data)
         _check(config)
-        self.config, self.statistics, self.scaler = config, statistics, scaler
-        self.names, self.units = names, units
+        self.config = config
+        statistics = data.statistics
         self.time_unit = statistics.median_gap / float(config.typical_gap or 1)
         longest = config.time_input_unit == "longest"
         self.time_input_unit = statistics.longest_delta if longest else statistics.median_gap
-        channels, hidden = statistics.channels, int(config.hidden_size or 1)
-        self.channels, self.hidden_size = channels, hidden
-        self.mean: Tensor
-        self.std: Tensor
-        self.register_buffer("mean", torch.tensor(statistics.mean), persistent=False)
-        self.register_buffer("std", torch.tensor(statistics.std), persistent=False)
+        channels, hidden = self.channels, int(config.hidden_size or 1)
+        self.hidden_size = hidden
 
         self.decay = _decay(config, channels, hidden)
         self.input_decay = InputDecay(channels) if config.input_decay else None
-        self.spec = _spec(config, channels, self.decay)
+        kind = CELLS["start" if config.cell == "none" else config.cell or "gru"]
+        self.spec = _spec(config, channels, self.decay, kind)
         anchored = self.spec.anchors
-        self.cell = Cell(
-            self.spec.gates,
-            2 * channels + self.spec.ages,
-            hidden_size=0 if config.cell == "none" else hidden,
-            innovation=anchored,
+        self.cell = kind(
+            2 * channels + self.spec.time_inputs,
+            hidden,
+            innovation=anchored if config.cell != "none" else 0,
             reset_after=self.spec.reset_after,
         )
         self.field = None
         if self.spec.field:
-            self.field = Perceptron(self.spec.field, self.spec.activation)
-        self.decoder = None
-        self.start = None
-        if anchored:
-            self.start = nn.Parameter(torch.zeros(channels))
-        else:
-            self.decoder = Perceptron((hidden, *(config.decoder_units or ()), channels), "tanh")
+            field = FIELDS[self.spec.field_kind]
+            sizes = (self.spec.field[0], *(config.field_units or ()), self.spec.field[-1])
+            self.field = field(sizes=sizes, activation=self.spec.activation)
+        self.start = nn.Parameter(torch.zeros(channels)) if anchored else None
+        shape = HeadShape(
+            channels=channels,
+            hidden_size=hidden,
+            anchored=bool(anchored),
+            units=tuple(config.decoder_units or ()),
+            mean=self.mean.clone(),
+            std=self.std.clone(),
+        )
+        self.head = HEADS[config.head or "point"](shape)
         self._initialise(seed)
 
     def _initialise(self, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
-        initialise(self, init=self.config.init or "normal", generator=generator)
+        init = self.config.init or "normal"
         with torch.no_grad():
+            for name, parameter in self.named_parameters():
+                if "bias" in name:
+                    continue
+                fan_in = init == "fan_in" and parameter.ndim >= 2
+                std = parameter.shape[1] ** -0.5 if fan_in else 0.1
+                parameter.normal_(0.0, std, generator=generator)
             for part in (self.decay, self.input_decay):
                 if isinstance(part, TrainableDecay | InputDecay):
                     part.weight.abs_()  # a negative weight of equation 26 gets no gradient
-            if self.config.init == "fan_in" and self.field is not None:
+            if init == "fan_in" and isinstance(self.field, Perceptron):
                 self.field.weights[-1].mul_(0.1)
             if self.start is not None:
                 self.start.zero_()
@@ -119,24 +121,21 @@ class Model(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Of the weights."""
-        return self.cell.inputs.dtype
+        return self.cell.bias.dtype
 
-    def batch(self, dataset: Dataset) -> Batch:
-        """Scales and pads a data set of this model's channels, in any order.
+    @property
+    def needs_generator(self) -> bool:
+        """Whether predictions draw random numbers: self-feeding does."""
+        return bool(self.config.self_feeding)
 
-        Raises:
-            InputError: channels differ from the model's, or their units where the data has any.
-        """
-        own = dict(zip(self.names, self.units, strict=True))
-        given = dict(zip(dataset.names, dataset.units, strict=True))
-        agree = own.keys() == given.keys() and all(
-            unit in ("", own[name]) or not own[name] for name, unit in given.items()
-        )
-        if not agree:
-            raise InputError(f"the model was made for other channels: {_difference(own, given)}")
-        if dataset.names != self.names:
-            dataset = dataset.select(self.names)
-        return Batch.of(dataset, scaler=self.scaler, dtype=self.dtype)
+    def threads(self) -> AbstractContextManager[None]:
+        """A context in which the threads go to what does the work of training this model."""
+        return choose(self.spec, self.dtype, self.device).backend.training()
+
+    @property
+    def acts(self) -> bool:
+        """Whether a channel is an action."""
+        return ACTION in self.roles
 
     def empty_state(
         self, batch: int, *, generator: torch.Generator | None = None
@@ -151,14 +150,10 @@ class Model(nn.Module):
             generator = torch.Generator().manual_seed(0)
         return RecurrentState.empty(self.first_state(batch), self.mean, generator=generator)
 
-    def runs_compiled(self) -> bool:
-        """Whether the scan of this model runs in compiled code here."""
-        if backend()[0] == "reference":
-            return False
-        nothing = torch.zeros(1, 1, dtype=self.dtype)
-        cells = torch.zeros(1, 1, self.channels, dtype=self.dtype)
-        rows = StepInputs(gap=nothing, update=nothing, values=cells, mask=cells)
-        return not cpu.unsupported(self.spec, self.scan_weights(), rows, self.first_state(1))
+    def backend(self) -> tuple[str, str]:
+        """The variant of the scan's backend that runs this model here, and why."""
+        choice = choose(self.spec, self.dtype, self.device)
+        return choice.variant, choice.reason
 
     def first_state(self, batch: int) -> Tensor:
         """(batch, state_size) before anything is observed.
@@ -175,93 +170,97 @@ class Model(nn.Module):
         self,
         batch: Batch,
         *,
-        carry: RecurrentState | None = None,
+        past: RecurrentState | None = None,
         generator: torch.Generator | None = None,
     ) -> Output:
         """Predicts every row of a batch from what was observed before it.
 
         Args:
             batch: scaled; rows to come, in order.
-            carry: what was seen before; by default nothing.
-            generator: generator of the generator of self-feeding; used where `carry` is not given.
+            past: what was seen before; by default nothing.
+            generator: of self-feeding; used where `past` is not given.
 
         Raises:
             InputError: the batch has other channels than the model.
         """
-        if carry is None:
-            carry = self.empty_state(len(batch), generator=generator)
-        rows, carried = self.step_inputs(batch, carry)
-        predictions, before, after = self.run(
-            rows, carry.state, generator=carry.generator, seen=carry.rows
-        )
-        carried = replace(carried, state=after[:, -1], updated=rows.update[:, -1] > 0)
-        return Output(predictions, before, after, carried)
+        if past is None:
+            past = self.empty_state(len(batch), generator=generator)
+        inputs, ended = self.step_inputs(batch, past)
+        output = self.run(inputs, past.state, generator=past.generator, seen=past.rows)
+        assert output.after is not None
+        ended = replace(ended, state=output.after[:, -1], updated=inputs.update[:, -1] > 0)
+        return replace(output, past=ended)
+
+    def prepare(self, batch: Batch) -> StepTable:
+        """The step inputs of a batch in one table.
+
+        Args:
+            batch: scaled.
+        """
+        return StepTable.of(self.step_inputs(batch)[0])
 
     def run(
         self,
-        rows: StepInputs | TableSteps,
+        prepared: StepInputs | TableSteps,
         state: Tensor | None = None,
         *,
         generator: torch.Generator | None = None,
         seen: int = 0,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Predicts rows whose facts are known: all of `forward` that a weight touches.
+    ) -> Output:
+        """Predicts rows whose step inputs are given: all of `forward` that has parameters.
 
         Args:
-            rows: from `step_inputs`.
+            prepared: from `step_inputs`, or some trajectories of `prepare`.
             state: (batch, state_size) before them; by default as nothing has been seen.
-            generator: generator of the generator of self-feeding.
+            generator: of self-feeding.
             seen: number of rows before them.
-
-        Returns:
-            Predictions (batch, rows, channels), states before and after each row
-            (batch, rows, state_size).
         """
         if state is None:
-            state = self.first_state(len(rows))
+            state = self.first_state(len(prepared))
         if self.config.self_feeding:
-            rows = replace(
-                rows, fed=_coins(generator, seen, rows.rows, float(self.config.self_feeding))
-            )
-        before, after = scan(self.spec, self.scan_weights(), rows, state)
+            fraction = float(self.config.self_feeding)
+            prepared = replace(prepared, fed=_fed(generator, seen, prepared.rows, fraction))
+        before, after = scan(self.spec, self.scan_parts(), prepared, state)
         read = before
         if self.config.readout == "last_row":
             shifted = torch.cat([state, after.flatten(1)[:, : -self.spec.state_size]], dim=1)
             read = shifted.view_as(after)
-        return self.read(read), before, after
+        found = self.head.decode(read)
+        if self.acts:
+            # An action is chosen at its row, so it is read after what was observed there.
+            then = self.head.decode(after)
+            acts = torch.tensor([role == ACTION for role in self.roles], device=after.device)
+            scale = found.scale
+            if scale is not None and then.scale is not None:
+                scale = torch.where(acts, then.scale, scale)
+            found = Prediction(torch.where(acts, then.mean, found.mean), scale)
+        return Output(found.mean, found.scale, before, after)
 
-    def read(self, state: Tensor) -> Tensor:
-        """(..., state_size) states to (..., channels) predictions in scaled units."""
-        if self.decoder is None:
-            return state[..., : self.channels] * self.std + self.mean
-        decoded: Tensor = self.decoder(state[..., : self.hidden_size])
-        return decoded
+    def loss(self, prediction: Prediction, target: Tensor, mask: Tensor | None) -> Tensor:
+        """The loss of the head."""
+        return self.head.loss(prediction, target, mask)
 
-    def scan_weights(self) -> ScanWeights:
+    def scan_parts(self) -> ScanParts:
         """All that is trained within the scan."""
-        return ScanWeights(
-            inputs=self.cell.inputs,
-            bias=self.cell.bias,
-            recurrent=self.cell.recurrent,
-            recurrent_bias=self.cell.recurrent_bias,
-            innovation=self.cell.innovation,
+        return ScanParts(
+            cell=self.cell,
             decay=self.decay.weights() if self.decay is not None else None,
             input_decay=self.input_decay.weights() if self.input_decay is not None else None,
-            field=self.field.layers if self.field is not None else (),
-            decoder=self.decoder.layers if self.spec.decoder and self.decoder is not None else (),
+            field=self.field,
+            decoder=self.head.layers if self.spec.decoder else (),
         )
 
     def step_inputs(
-        self, batch: Batch, carry: RecurrentState | None = None
+        self, batch: Batch, past: RecurrentState | None = None
     ) -> tuple[StepInputs, RecurrentState]:
-        """What is known of each row; no weight has touched it, so it holds for all of a training.
+        """The inputs of each step, which do not depend on trained parameters.
 
         Args:
             batch: scaled; rows to come, in order.
-            carry: what was seen before; by default nothing.
+            past: what was seen before; by default nothing.
 
         Returns:
-            The facts, and the carry of the last row but for its state.
+            The inputs, and the past after the last row but for its state.
 
         Raises:
             InputError: the batch has other channels than the model.
@@ -271,11 +270,14 @@ class Model(nn.Module):
                 f"the batch has {batch.channels} channels, the model has {self.channels}"
             )
         config, dtype, unit, spec = self.config, self.dtype, self.time_unit, self.spec
-        if carry is None:
-            carry = self.empty_state(len(batch))
-        at_rows, carried = ages(
+        if past is None:
+            past = self.empty_state(len(batch))
+        ended_actions = None
+        if self.acts:
+            batch, ended_actions = self._with_actions(batch, past)
+        at_rows, ended = elapsed_times(
             batch,
-            carry,
+            past,
             elapsed_limit=self.statistics.longest_elapsed * float(config.gap_limit or 1),
             from_first_row=config.clock == "first_row",
         )
@@ -293,14 +295,15 @@ class Model(nn.Module):
             update=update.to(dtype),
             values=values,
             mask=mask.to(dtype),
-            age=self._age(at_rows),
-            length=batch.valid.sum(dim=1),
+            time_input=self._time_input(at_rows),
+            # A single row is no padding, and a stream of them is a simpler graph.
+            length=batch.valid.sum(dim=1) if batch.rows > 1 else None,
         )
         delta = (at_rows.delta / unit).to(dtype) if spec.decay or spec.input_decay else None
         if spec.input_decay:
             rows = replace(rows, delta=delta, last=at_rows.last, mean=self.mean)
         if spec.decay:
-            updated = torch.cat([carry.updated[:, None], update[:, :-1]], dim=1)
+            updated = torch.cat([past.updated[:, None], update[:, :-1]], dim=1)
             start, end = at_rows.delta_before, at_rows.delta
             if not isinstance(self.decay, TrainableDecay):
                 start, end = at_rows.elapsed_before[..., None], at_rows.elapsed[..., None]
@@ -311,10 +314,23 @@ class Model(nn.Module):
                 decay_start=(start / unit).to(dtype),
                 decay_end=delta,
             )
-        return rows, carried
+        if ended_actions is not None:
+            ended = replace(ended, actions=ended_actions)
+        return rows, ended
 
-    def _age(self, at_rows: ElapsedTimes) -> Tensor | None:
-        """(batch, rows, ages) what tells a plain cell how old its knowledge is."""
+    def _with_actions(self, batch: Batch, past: RecurrentState) -> tuple[Batch, Tensor]:
+        """The batch with each action moved to the row after it, and the actions of the last row."""
+        last = past.actions
+        if last is None:
+            last = torch.full_like(batch.values[:, 0], torch.nan)
+        at = (batch.valid.sum(dim=1) - 1)[:, None, None].expand(-1, 1, batch.channels)
+        acts = torch.tensor([role == ACTION for role in self.roles], device=batch.mask.device)
+        ended = torch.where(batch.mask & acts, batch.values, torch.nan).gather(1, at)[:, 0]
+        seen = ~last.isnan()
+        return batch.inputs(torch.where(seen, last, 0.0), seen), ended
+
+    def _time_input(self, at_rows: ElapsedTimes) -> Tensor | None:
+        """(batch, rows, time_inputs) times since observation for the cell."""
         name, unit = self.config.time_input, self.time_input_unit
         if name == "delta":
             longest = self.statistics.longest_delta * float(self.config.gap_limit or 1)
@@ -326,21 +342,31 @@ class Model(nn.Module):
 
 
 def _spec(
-    config: ModelConfig, channels: int, decay: TrainableDecay | ExponentialDecay | None
+    config: ModelConfig,
+    channels: int,
+    decay: TrainableDecay | ExponentialDecay | None,
+    cell: type[Cell],
 ) -> ScanSpec:
     hidden = int(config.hidden_size or 1)
     driven = hidden + (channels if config.anchored else 0)
     decay_rows = config.decay_rows or "continuous"
     if decay_rows == "every_row" and not isinstance(decay, TrainableDecay):
         decay_rows = "continuous"  # of elapsed time the two are the same
+    kind = config.vector_field or "none"
+    units = tuple(config.field_units or ()) if kind == "mlp" else ()
     return ScanSpec(
         channels=channels,
         hidden_size=hidden,
+        cell="start" if config.cell == "none" else config.cell or "gru",
+        gates=cell.gates_per_unit * hidden,
+        memory=cell.memory_per_unit * hidden,
         anchored=bool(config.anchored),
-        cell="set" if config.cell == "none" else config.cell or "gru",
-        reset_after=bool(config.reset_after) and config.cell == "gru",
-        ages={"none": 0, "elapsed": 1, "gap": 1, "delta": channels}[config.time_input or "none"],
-        field=(driven, *(config.field_units or ()), driven) if config.vector_field == "mlp" else (),
+        reset_after=bool(config.reset_after) and cell.takes_reset_after,
+        time_inputs={"none": 0, "elapsed": 1, "gap": 1, "delta": channels}[
+            config.time_input or "none"
+        ],
+        field=() if kind == "none" else (driven, *units, driven),
+        field_kind="mlp" if kind == "none" else kind,
         activation=config.activation or "tanh",
         solver=config.solver or "euler",
         steps_per_gap=config.steps_per_gap or 1,
@@ -355,14 +381,14 @@ def _spec(
     )
 
 
-def _coins(
-    generator: torch.Generator | None, seen: int, rows: int, share: float
+def _fed(
+    generator: torch.Generator | None, seen: int, rows: int, fraction: float
 ) -> tuple[bool, ...]:
-    """One coin per row, drawn row by row so that a stream draws the same; never at row 0."""
+    """Rows that are fed the decoded state; drawn row by row, as a stream draws; never row 0."""
     if generator is None:
-        raise InputError("self-feeding draws generator: the carry needs a generator (empty_state)")
+        raise InputError("self-feeding draws random numbers: give a generator (empty_state)")
     drawn = torch.rand(rows, generator=generator).tolist()  # the same draws as one by one
-    return tuple(coin < share and seen + i > 0 for i, coin in enumerate(drawn))
+    return tuple(number < fraction and seen + i > 0 for i, number in enumerate(drawn))
 
 
 def _decay(
@@ -392,20 +418,7 @@ def _check(config: ModelConfig) -> None:
             "decay_rows='observed_rows' with readout='target' would tell a prediction whether its "
             "own row is observed; use readout='last_row', or another decay_rows"
         )
+    if config.self_feeding and config.head != "point":
+        raise InputError(f"self_feeding needs the head 'point', got {config.head!r}")
     if config.anchored and config.input_decay:
         raise InputError("an anchored state holds the channels: leave input_decay off")
-
-
-def _difference(own: dict[str, str], given: dict[str, str]) -> str:
-    """What to change in the data for it to have the channels of the model."""
-    units = (
-        f"{name} is in {given[name]}, not {unit}"
-        for name, unit in own.items()
-        if given.get(name, "") not in ("", unit)
-    )
-    named = {
-        "the data lacks": own.keys() - given.keys(),
-        "the model does not know": given.keys() - own.keys(),
-    }
-    parts = [f"{what} {', '.join(sorted(names))}" for what, names in named.items() if names]
-    return "; ".join([*parts, *units]) + "; give it the channels it was made for"

@@ -1,20 +1,32 @@
-"""The zoo: each model of the field as a choice of parts. Table 2.1 of the thesis, as code."""
+"""The zoo: each model of the field as a choice of parts and a training recipe.
+
+Table 2.1 of the thesis, as code. Models of one's own are registered beside it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
-from offbeat.config import ModelConfig, TrainConfig, from_mapping
+import torch
+from torch import nn
+
+from offbeat.config import ModelConfig, Recipe, TrainConfig, from_mapping
 from offbeat.data.batch import Batch
 from offbeat.data.scaler import Scaler, ScalerKind, check_observed
 from offbeat.data.trajectory import Dataset
+from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError, one_of
+from offbeat.models.base import BaseModel, DataInfo
+from offbeat.models.foreign import ForeignModel
 from offbeat.models.model import Model
 from offbeat.models.statistics import Statistics
+from offbeat.registry import Registry
 
 _COMMON: dict[str, Any] = {
     "hidden_size": 15,
+    "head": "point",
     "decoder_units": (100,),
     "cell": "gru",
     "reset_after": False,
@@ -66,6 +78,88 @@ ZOO: dict[str, dict[str, Any]] = {
 THESIS_MODELS = ("gru", "gru_d", "ode_rnn", "ode_gru_d")
 """The four models that the thesis compares."""
 
+_THESIS_RECIPE: dict[str, Any] = {
+    "epochs": 50,
+    "batch_size": 50,
+    "optimizer": "adamax",
+    "learning_rate": 1e-3,
+    "schedule": "constant",
+    "loss_scale": 1.0,
+}
+_ANCHORED_RECIPE: dict[str, Any] = {
+    **_THESIS_RECIPE,
+    "optimizer": "adam",
+    "learning_rate": 0.002,
+    "schedule": "cosine",
+    "clip_norm": 1.0,
+    "loss_scale": 100.0,
+}
+_FOREIGN_RECIPE: dict[str, Any] = {**_THESIS_RECIPE, "optimizer": "adam"}
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """An entry of the registry of models.
+
+    Attributes:
+        options: fields of `ModelConfig` that differ from the common choice.
+        recipe: fields of `TrainConfig` that the model is trained with unless told otherwise.
+        factory: of a model of one's own: (data, **options) to a module; None for a composed one.
+    """
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+    factory: Callable[..., nn.Module] | None = None
+
+
+MODELS: Registry[ModelEntry] = Registry("model", group="offbeat.models")
+"""Models by the name that `make_model` takes."""
+
+for _name, _options in ZOO.items():
+    # An anchored state holds the prediction itself, so one bad step is seen by all that follow:
+    # it needs Adam, cosine decay and clipped gradients.
+    _recipe = _ANCHORED_RECIPE if _options.get("anchored") else _THESIS_RECIPE
+    MODELS.register(_name, ModelEntry(_options, _recipe))
+
+
+def list_models() -> tuple[str, ...]:
+    """Names of all models that `make_model` makes, those of other packages included."""
+    return tuple(MODELS)
+
+
+def register_model(
+    name: str,
+    model: Callable[..., nn.Module] | Mapping[str, Any],
+    *,
+    recipe: Mapping[str, Any] | None = None,
+    replace: bool = False,
+) -> None:
+    """Adds a model that `make_model`, `fit`, `evaluate` and the command line know by name.
+
+    Args:
+        name: of the model.
+        model: a class or function that is called with a `DataInfo` and keyword options and gives a
+            `torch.nn.Module` whose `forward(batch)` returns a `Prediction` of every row from what
+            was observed before it; or a choice of parts, as fields of `ModelConfig`.
+        recipe: fields of `TrainConfig` to train it with; by default Adam at 0.001 for a module,
+            and that of the thesis for a choice of parts.
+        replace: allow a name that is taken.
+
+    Raises:
+        InputError: the name is taken, or a field is unknown.
+    """
+    composed = isinstance(model, Mapping)
+    common = _THESIS_RECIPE if composed else _FOREIGN_RECIPE
+    chosen = {**common, **(recipe or {})}
+    from_mapping(TrainConfig, chosen)
+    if isinstance(model, Mapping):
+        for key in model:
+            one_of("model option", key, [f.name for f in fields(ModelConfig)])
+        entry = ModelEntry(dict(model), chosen)
+    else:
+        entry = ModelEntry({}, chosen, model)
+    MODELS.register(name, entry, replace=replace)
+
 
 def resolve(config: ModelConfig) -> ModelConfig:
     """Fills what a config leaves open with the choice of its zoo entry.
@@ -73,8 +167,7 @@ def resolve(config: ModelConfig) -> ModelConfig:
     Raises:
         InputError: the zoo has no such entry.
     """
-    one_of("model", config.name, ZOO)
-    chosen = {**_COMMON, **ZOO[config.name]}
+    chosen = {**_COMMON, **MODELS[config.name].options}
     still_open = {
         f.name: chosen[f.name]
         for f in fields(config)
@@ -107,30 +200,31 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
 
 
 def train_config(name: str, **options: Any) -> TrainConfig:
-    """The training that a model was measured with: the thesis' own, unless stated otherwise.
-
-    The anchored model trains with Adam, cosine decay and clipped gradients, which it needs: its
-    state holds the prediction itself, so one bad step is seen by all that follow.
+    """The recipe of a model: how it is trained unless told otherwise, every field set.
 
     Args:
-        name: id of the zoo's entry.
-        **options: fields of `TrainConfig`, `epochs` above all.
+        name: of the model.
+        **options: fields of `TrainConfig` that replace those of the recipe.
 
     Raises:
-        InputError: the zoo has no such entry, or an option is out of its range.
+        InputError: there is no such model, or an option is out of its range.
     """
-    one_of("model", name, ZOO)
-    own: dict[str, Any] = {}
-    if ZOO[name].get("anchored"):
-        own = {
-            "optimizer": "adam",
-            "learning_rate": 0.002,
-            "schedule": "cosine",
-            "clip_norm": 1.0,
-            "loss_scale": 100.0,
-        }
-    config: TrainConfig = from_mapping(TrainConfig, {**own, **options})
+    given = {key: value for key, value in options.items() if value is not None}
+    config: TrainConfig = from_mapping(TrainConfig, {**MODELS[name].recipe, **given})
     return config
+
+
+def recipe_of(name: str, config: TrainConfig | None = None, *, validated: bool) -> Recipe:
+    """How a model is trained: what is asked for, and the model's own recipe beside it.
+
+    Args:
+        name: of the model; one that is not registered gets the recipe of a module of one's own.
+        config: what is asked for; None leaves everything to the recipe.
+        validated: whether there is a validation set; the best weights on it are kept then.
+    """
+    own = MODELS[name].recipe if name in MODELS else _FOREIGN_RECIPE
+    asked = {} if config is None else {k: v for k, v in asdict(config).items() if v is not None}
+    return Recipe(**{"keep": "best" if validated else "last", **own, **asked})
 
 
 def make_model(
@@ -140,15 +234,19 @@ def make_model(
     scaler: ScalerKind | Scaler = "standardise",
     seed: int = 0,
     **options: Any,
-) -> Model:
+) -> Any:
     """Makes an untrained model for the channels, scales and gaps of a training set.
 
     Args:
-        model: id of the zoo's entry, or a config.
-        train: the training part; means, scales and gaps are measured on its observed cells.
+        model: name of a model, or a config.
+        train: the training set; means, scales and gaps are measured on its observed values.
         scaler: a kind, fitted on `train`, or a scaler fitted elsewhere.
         seed: of the initial weights.
-        **options: fields of `ModelConfig` that replace the entry's own.
+        **options: fields of `ModelConfig` that replace the entry's own; for a model of one's own,
+            the arguments of its factory.
+
+    Returns:
+        A `Model`, or a `ForeignModel` for a model of one's own.
 
     Raises:
         InputError: unknown model or option, or a channel that is never observed.
@@ -156,10 +254,17 @@ def make_model(
     Example:
         >>> model = make_model("ode_rnn", train, hidden_size=32)  # doctest: +SKIP
     """
+    name = model if isinstance(model, str) else model.name
+    entry = MODELS[name]
+    if entry.factory is not None:
+        return _foreign(name, entry.factory, _info(train, scaler), options, seed)
     config = ModelConfig(name=model) if isinstance(model, str) else model
     for key in options:
         one_of("model option", key, [f.name for f in fields(config)])
-    config = resolve(replace(config, **options))
+    return Model(resolve(replace(config, **options)), _info(train, scaler), seed=seed)
+
+
+def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
     check_observed(train.names, sum(t.observed.sum(axis=0) for t in train), len(train))
     if isinstance(scaler, str):
         scaler = Scaler.fit(scaler, train)
@@ -167,5 +272,45 @@ def make_model(
         raise InputError(
             f"the scaler has {len(scaler.shift)} channels, the data has {train.channels}"
         )
-    statistics = Statistics.of(Batch.of(train, scaler=scaler))
-    return Model(config, statistics, scaler=scaler, names=train.names, units=train.units, seed=seed)
+    batch = Batch.of(train, scaler=scaler)
+    return DataInfo(
+        train.names,
+        train.units,
+        batch.roles,
+        scaler,
+        Statistics.of(batch),
+        Transforms.of(train),
+    )
+
+
+def build(name: str, config: Mapping[str, Any], data: DataInfo, *, seed: int = 0) -> BaseModel:
+    """Makes a model from what a checkpoint says.
+
+    Args:
+        name: of the model.
+        config: fields of `ModelConfig`, or the options of a model of one's own.
+        data: what it was made for.
+        seed: of the initial weights.
+
+    Raises:
+        InputError: a field is wrong.
+    """
+    if name in MODELS and (factory := MODELS[name].factory) is not None:
+        return _foreign(name, factory, data, dict(config), seed)
+    return Model(from_mapping(ModelConfig, dict(config)), data, seed=seed)
+
+
+def _foreign(
+    name: str,
+    factory: Callable[..., nn.Module],
+    data: DataInfo,
+    options: dict[str, Any],
+    seed: int,
+) -> ForeignModel:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        try:
+            module = factory(data, **options)
+        except TypeError as error:
+            raise InputError(f"the model {name!r} cannot be made: {error}") from error
+    return ForeignModel(name, module, data, options)

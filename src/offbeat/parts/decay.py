@@ -1,6 +1,6 @@
-"""Decay parts: how h fades with time, and how a last value fades to the mean.
+"""Decays: how h decays with time, and how a last value decays to the training mean.
 
-They hold the weights; the exponents are made inside the scan, from the ages of a row.
+They hold the weights. The exponents are computed inside the scan, from times since observation.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 
 class TrainableDecay(nn.Module):
-    """gamma_h = exp(-max(0, W delta + b)) of equation 26, from the ages of all channels.
+    """gamma_h = exp(-max(0, W delta + b)) of equation 26, from the time since observation of each channel.
 
     Args:
         channels: number of channels.
@@ -48,7 +48,7 @@ class ExponentialDecay(nn.Module):
 
 
 class InputDecay(nn.Module):
-    """x-hat of equation 27: the last value, fading to the mean with a diagonal gamma_x.
+    """x-hat of equation 27: the last value, decaying to the mean with a diagonal gamma_x.
 
     Args:
         channels: number of channels.

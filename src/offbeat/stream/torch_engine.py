@@ -93,7 +93,7 @@ class TorchEngine(Engine):
         if carry.generator is not None:  # it acts after the prediction
             carry = replace(carry, generator=torch.Generator())
         with torch.inference_mode():
-            predicted: Tensor = self._model(asked, carry=carry).predictions
+            predicted: Tensor = self._model(asked, carry=carry).mean
             return predicted[:, 0].double().numpy()
 
     def save(self, slot: int) -> None:

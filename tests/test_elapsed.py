@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from model_helpers import TICK
+from model_helpers import TICK, rows_of
 from numpy.typing import NDArray
 
 from offbeat import Batch, Trajectory
-from offbeat.models.elapsed import ElapsedTimes, RecurrentState, ages
+from offbeat.models.elapsed import ElapsedTimes, RecurrentState
 
 FAR = 1e6
 NAMES = [field.name for field in fields(ElapsedTimes)]
@@ -58,7 +58,7 @@ def measured(
     case: Case, batch: Batch, carry: RecurrentState | None = None
 ) -> tuple[ElapsedTimes, RecurrentState]:
     carry = carry or empty(batch)
-    return ages(batch, carry, elapsed_limit=case.limit, from_first_row=case.from_first_row)
+    return elapsed_times(batch, carry, elapsed_limit=case.limit, from_first_row=case.from_first_row)
 
 
 def by_hand(
@@ -75,7 +75,7 @@ def by_hand(
     def since_observed(time: float | None) -> float:
         return 0.0 if latest is None or time is None else min(time - latest, limit)
 
-    def channel_ages(time: float | None) -> list[float]:
+    def channel_elapsed_times(time: float | None) -> list[float]:
         if start is None or time is None:
             return [0.0] * one.channels
         lost = 0.0 if latest is None else max(time - latest - limit, 0.0)
@@ -88,8 +88,8 @@ def by_hand(
         found["elapsed"].append(since_observed(time))
         found["elapsed_before"].append(since_observed(before))
         found["gap"].append(since_observed(time) - since_observed(before))
-        found["delta"].append(channel_ages(time))
-        found["delta_before"].append(channel_ages(before))
+        found["delta"].append(channel_elapsed_times(time))
+        found["delta_before"].append(channel_elapsed_times(before))
         found["last"].append(list(last))
         found["observed"].append(bool(mask.any()))
         found["first"].append(bool(mask.any()) and not seen)
@@ -117,7 +117,7 @@ def test_a_carry_over_any_split_of_the_rows_gives_the_same(case: Case, cuts: lis
     edges = sorted({0, batch.rows, *(c for c in cuts if c < batch.rows)})
     carry, parts = empty(batch), []
     for start, stop in pairwise(edges):
-        part, carry = measured(case, batch.rows_between(start, stop), carry)
+        part, carry = measured(case, rows_of(batch, start, stop), carry)
         parts.append(part)
     for name in NAMES:
         joined = torch.cat([getattr(part, name) for part in parts], dim=1)
@@ -154,7 +154,7 @@ def test_rows_with_nothing_observed_change_nothing_at_other_rows(case: Case) -> 
 
 
 @given(cases())
-def test_padding_is_a_pause_in_which_nothing_ages(case: Case) -> None:
+def test_padding_is_a_pause_in_which_nothing_elapsed_times(case: Case) -> None:
     got, _ = measured(case, case.batch)
     for i, one in enumerate(case.trajectories):
         assert not got.observed[i, one.rows :].any()
@@ -179,7 +179,7 @@ def test_time_since_the_last_observation_stops_at_its_limit() -> None:
         observed=np.array([[True], [False], [False], [False], [True], [False]]),
     )
     batch = Batch.of([one])
-    got, _ = ages(batch, empty(batch), elapsed_limit=2.5)
+    got, _ = elapsed_times(batch, empty(batch), elapsed_limit=2.5)
     assert got.elapsed[0].tolist() == [0, 1, 2.5, 2.5, 2.5, 1]
     assert got.delta[0, :, 0].tolist() == [0, 1, 2.5, 2.5, 2.5, 1]
     assert got.gap[0].tolist() == [0, 1, 1.5, 0, 0, 1]
@@ -190,7 +190,7 @@ def test_time_since_the_last_observation_stops_at_its_limit() -> None:
 def test_limited_ages_never_exceed_the_limit_nor_shrink_between_observations(case: Case) -> None:
     batch = case.batch
     limit = 40 * TICK
-    got, _ = ages(batch, empty(batch), elapsed_limit=limit)
+    got, _ = elapsed_times(batch, empty(batch), elapsed_limit=limit)
     for name in ("elapsed", "elapsed_before", "gap"):
         value = getattr(got, name)
         assert ((value >= 0) & (value <= limit)).all(), name
@@ -204,7 +204,7 @@ def test_limited_ages_never_exceed_the_limit_nor_shrink_between_observations(cas
 def test_nothing_observed_means_that_no_time_passes() -> None:
     one = Trajectory([0.0, 5.0, 1e4], np.zeros((3, 3)), observed=np.zeros((3, 3), dtype=bool))
     batch = Batch.of([one], dtype=torch.float64)
-    got, carry = ages(batch, empty(batch), elapsed_limit=FAR)
+    got, carry = elapsed_times(batch, empty(batch), elapsed_limit=FAR)
     for name in ("gap", "elapsed", "elapsed_before", "delta", "delta_before"):
         assert (getattr(got, name) == 0).all(), name
     assert (got.last == MEAN).all()

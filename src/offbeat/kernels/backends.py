@@ -1,0 +1,173 @@
+"""Backends of the scan: a registry, and the choice among them.
+
+A backend is one module that registers what it supports and how it scans. `OFFBEAT_SCAN` in the
+environment, or `use`, names the one to take: `auto`, the name of a backend, or one of its variants.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from offbeat.errors import InputError, one_of
+from offbeat.kernels.spec import Layers, ScanParts, ScanSpec, StepInputs, TableSteps
+from offbeat.registry import Registry
+
+States = tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to run scans.
+
+    Attributes:
+        name: what `OFFBEAT_SCAN` takes.
+        supports: (spec, dtype, device) to None, or to the reason why such scans cannot run.
+        scan: (spec, parts, inputs, state, variant) to the states before and after each step, or to
+            None where this very call cannot run although its spec is supported.
+        variants: names of its variants, such as instruction sets, which `OFFBEAT_SCAN` takes too.
+        available: those variants that run here, best first; nothing where the backend was not
+            built. A backend without variants gives its own name.
+        why_not: the reason where none is available.
+        perceptron: (layers, x, activation, variant) to the outputs, or to None where the call
+            cannot run; None for a backend without one.
+        training: a context in which a model is trained with this backend.
+    """
+
+    name: str
+    supports: Callable[[ScanSpec, torch.dtype, torch.device], str | None]
+    scan: Callable[
+        [ScanSpec, ScanParts, StepInputs | TableSteps, Tensor, str | None], States | None
+    ]
+    variants: tuple[str, ...] = ()
+    available: Callable[[], Sequence[str]] | None = None
+    why_not: Callable[[], str] = str
+    perceptron: Callable[[Layers, Tensor, str, str | None], Tensor | None] | None = None
+    training: Callable[[], AbstractContextManager[None]] = nullcontext
+
+    def runnable(self) -> Sequence[str]:
+        """The variants that run here, best first."""
+        return (self.name,) if self.available is None else self.available()
+
+
+BACKENDS: Registry[Backend] = Registry("scan backend", group="offbeat.backends")
+"""Backends by name; `auto` takes the first that supports a scan, `reference` last."""
+
+REFERENCE = "reference"
+ALIASES = {"fused": "cpu"}
+"""Names of 0.1.0."""
+
+
+def register_backend(backend: Backend, *, replace: bool = False) -> Backend:
+    """Adds a backend of the scan; returns it.
+
+    Args:
+        backend: tried by `auto` before those that were registered earlier.
+        replace: allow a name that is taken.
+
+    Raises:
+        InputError: the name is taken.
+    """
+    return BACKENDS.register(backend.name, backend, replace=replace)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A backend for a spec.
+
+    Attributes:
+        backend: that runs it.
+        variant: of the backend.
+        reason: why this one.
+    """
+
+    backend: Backend
+    variant: str
+    reason: str
+
+
+_chosen: ContextVar[str | None] = ContextVar("offbeat_scan", default=None)
+
+
+def choose(
+    spec: ScanSpec | None = None,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | None = None,
+) -> Choice:
+    """The backend that scans of a spec run in here.
+
+    Args:
+        spec: of the scan; by default any that all backends support.
+        dtype: of the state.
+        device: of the state; by default the CPU.
+
+    Raises:
+        InputError: a backend is asked for that cannot run here.
+    """
+    device = device or torch.device("cpu")
+    name, where = _chosen.get(), "offbeat.kernels.use"
+    if name is None:
+        name, where = os.environ.get("OFFBEAT_SCAN", "auto"), "OFFBEAT_SCAN"
+    name = ALIASES.get(name, name)
+    named = {variant: each for each in BACKENDS.values() for variant in each.variants}
+    one_of("scan backend", name, ("auto", *BACKENDS, *named, *ALIASES))
+    reference = BACKENDS[REFERENCE]
+    if name == REFERENCE:
+        return Choice(reference, REFERENCE, f"asked for by {where}")
+    reasons = []
+    if name == "auto":
+        for backend in reversed(list(BACKENDS.values())):
+            if backend is reference:
+                continue
+            reason = _why_not(backend, spec, dtype, device)
+            if reason is None:
+                return Choice(backend, backend.runnable()[0], "the best that runs here")
+            reasons.append(f"{backend.name}: {reason}")
+        return Choice(reference, REFERENCE, "; ".join(reasons) or "the only one there is")
+    backend = named.get(name) or BACKENDS[name]
+    runnable = backend.runnable()
+    if not runnable:
+        raise InputError(
+            f"{where} asks for the scan backend {name!r}, but the backend {backend.name} was not "
+            f"built ({backend.why_not()}); install Offbeat where a C++ compiler is"
+        )
+    variant = name if name in named else runnable[0]
+    if variant not in runnable:
+        raise InputError(
+            f"{where} asks for the scan backend {name!r}; this processor runs {', '.join(runnable)}"
+        )
+    reason = _why_not(backend, spec, dtype, device)
+    if reason is not None:
+        return Choice(reference, REFERENCE, f"{backend.name}: {reason}")
+    return Choice(backend, variant, f"asked for by {where}")
+
+
+def _why_not(
+    backend: Backend, spec: ScanSpec | None, dtype: torch.dtype, device: torch.device
+) -> str | None:
+    if not backend.runnable():
+        return f"it was not built ({backend.why_not()})"
+    return None if spec is None else backend.supports(spec, dtype, device)
+
+
+@contextmanager
+def use(name: str) -> Iterator[str]:
+    """Runs scans in the named backend within a `with` block; yields the variant that runs.
+
+    Args:
+        name: `auto`, a backend, or one of its variants.
+
+    Raises:
+        InputError: it cannot run here.
+    """
+    token = _chosen.set(name)
+    try:
+        yield choose().variant
+    finally:
+        _chosen.reset(token)

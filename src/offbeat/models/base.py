@@ -1,0 +1,175 @@
+"""What every model has: the data it was made for, batches of it, predictions and a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from offbeat.data.batch import Batch
+from offbeat.data.scaler import Scaler
+from offbeat.data.trajectory import Dataset
+from offbeat.data.transforms import Transforms
+from offbeat.errors import InputError
+from offbeat.models.statistics import Statistics
+from offbeat.parts.heads import Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class DataInfo:
+    """What a model knows of the data it was made for; saved with it.
+
+    Attributes:
+        names: channel names, which data must match.
+        units: channel units.
+        roles: per channel `state`, `action` or `exogenous`.
+        scaler: maps original units to the scaled ones that the model works in.
+        statistics: measured on the training set.
+        transforms: what the data went through before a model sees it.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    roles: tuple[str, ...]
+    scaler: Scaler
+    statistics: Statistics
+    transforms: Transforms = field(default_factory=Transforms.identity)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.names)
+
+
+class Prepared(Sized, Protocol):
+    """A data set in the form that `BaseModel.run` takes, a part at a time."""
+
+    def take(self, index: Tensor) -> Any:
+        """Some trajectories.
+
+        Args:
+            index: (batch,) positions, int64.
+        """
+
+
+class BaseModel(nn.Module):
+    """Base class of models: what fitting, scoring and answering need of one.
+
+    A subclass defines `prepare` and `run`, or `forward` alone.
+
+    Args:
+        name: shown in tables, and the name of its registry entry.
+        data: what it was made for.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, name: str, data: DataInfo) -> None:
+        super().__init__()
+        self.name, self.data = name, data
+        self.names, self.units, self.roles = data.names, data.units, data.roles
+        self.scaler, self.statistics = data.scaler, data.statistics
+        self.transforms, self.channels = data.transforms, data.channels
+        self.register_buffer("mean", torch.tensor(data.statistics.mean), persistent=False)
+        self.register_buffer("std", torch.tensor(data.statistics.std), persistent=False)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Of the trained parameters."""
+        return self.mean.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Of the trained parameters."""
+        return self.mean.device
+
+    @property
+    def needs_generator(self) -> bool:
+        """Whether a prediction draws random numbers."""
+        return False
+
+    def batch(self, dataset: Dataset) -> Batch:
+        """Transforms, scales and pads a data set of this model's channels, in any order.
+
+        Returns:
+            The batch, on the model's device.
+
+        Raises:
+            InputError: channels differ from the model's, or their units where the data has any.
+        """
+        own = dict(zip(self.names, self.units, strict=True))
+        given = dict(zip(dataset.names, dataset.units, strict=True))
+        agree = own.keys() == given.keys() and all(
+            unit in ("", own[name]) or not own[name] for name, unit in given.items()
+        )
+        if not agree:
+            raise InputError(f"the model was made for other channels: {_difference(own, given)}")
+        if dataset.names != self.names:
+            dataset = dataset.select(self.names)
+        dataset = self.transforms.apply(dataset)
+        batch = Batch.of(dataset, scaler=self.scaler, dtype=self.dtype, roles=self.roles)
+        return batch.to(self.device)
+
+    def prepare(self, batch: Batch) -> Prepared:
+        """What `run` takes of a batch, computed once for a data set.
+
+        Args:
+            batch: scaled.
+        """
+        return batch
+
+    def run(self, prepared: Any, *, generator: torch.Generator | None = None) -> Prediction:
+        """Predicts every row of prepared data from what was observed before it.
+
+        Args:
+            prepared: from `prepare`, whole or some trajectories of it.
+            generator: of random numbers, for models that need one.
+        """
+        prediction: Prediction = self(prepared)
+        return prediction
+
+    def loss(self, prediction: Prediction, target: Tensor, mask: Tensor | None) -> Tensor:
+        """Mean squared error over the entries that count; see `parts.Head.loss`."""
+        squared = (prediction.mean - target).square()
+        if mask is None:
+            return squared.mean()
+        return (squared * mask).sum() / mask.sum().clamp_min(1)
+
+    def backend(self) -> tuple[str, str]:
+        """What runs this model here, and why."""
+        return "torch", "a model of its own"
+
+    def threads(self) -> AbstractContextManager[None]:
+        """A context in which the threads go to what does the work of training this model."""
+        return nullcontext()
+
+    def save(self, path: str | Path) -> None:
+        """Writes the model to a folder, atomically: `model.safetensors` and `config.json`.
+
+        Args:
+            path: the folder; one that is there is replaced.
+        """
+        from offbeat.models.checkpoint import save_model
+
+        save_model(self, path)
+
+
+def _difference(own: dict[str, str], given: dict[str, str]) -> str:
+    """What to change in the data for it to have the channels of the model."""
+    units = (
+        f"{name} is in {given[name]}, not {unit}"
+        for name, unit in own.items()
+        if given.get(name, "") not in ("", unit)
+    )
+    named = {
+        "the data lacks": own.keys() - given.keys(),
+        "the model does not know": given.keys() - own.keys(),
+    }
+    parts = [f"{what} {', '.join(sorted(names))}" for what, names in named.items() if names]
+    return "; ".join([*parts, *units]) + "; give it the channels it was made for"

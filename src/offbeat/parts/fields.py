@@ -1,0 +1,48 @@
+"""Vector fields: the derivative of the state between observations (equation 36)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from offbeat.kernels.reference import perceptron
+from offbeat.kernels.spec import Layers
+from offbeat.registry import Registry
+
+
+class Perceptron(nn.Module):
+    """Linear layers with a nonlinearity between them, none after the last.
+
+    Args:
+        sizes: units of input, hidden layers and output.
+        activation: `tanh` or `silu`.
+    """
+
+    def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
+        super().__init__()
+        self.activation = activation
+        pairs = list(pairwise(sizes))
+        self.weights = nn.ParameterList(torch.empty(out, into) for into, out in pairs)
+        self.biases = nn.ParameterList(torch.zeros(out) for _, out in pairs)
+
+    @property
+    def layers(self) -> Layers:
+        """Weight and bias of each layer."""
+        return tuple(zip(self.weights, self.biases, strict=True))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) to (..., outputs)."""
+        return perceptron(self.layers, x, self.activation)
+
+
+FIELDS: Registry[Callable[..., nn.Module]] = Registry("vector field", group="offbeat.fields")
+"""Vector fields by the name that `ModelConfig.vector_field` takes.
+
+An entry is called with `sizes` (units of each layer, ends included) and `activation`, and gives a
+module that maps (batch, sizes[0]) to a derivative of the same shape.
+"""
+
+FIELDS.register("mlp", Perceptron)

@@ -1,0 +1,173 @@
+"""Heads: from a state to a prediction, and the loss of that prediction."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import mse_loss, softplus
+
+from offbeat.kernels import perceptron
+from offbeat.parts.fields import Perceptron
+from offbeat.registry import Registry
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a model expects at each row, in scaled units.
+
+    Attributes:
+        mean: (batch, rows, channels).
+        scale: (batch, rows, channels) standard deviation, of heads that have one; else None.
+    """
+
+    mean: Tensor
+    scale: Tensor | None = None
+
+    def map(self, function: Any) -> Prediction:
+        """The same prediction with `function` applied to each of its tensors."""
+        scale = None if self.scale is None else function(self.scale)
+        return replace(self, mean=function(self.mean), scale=scale)
+
+
+@dataclass(frozen=True, eq=False)
+class HeadShape:
+    """What a head is made for.
+
+    Attributes:
+        channels: width of the prediction.
+        hidden_size: units of h.
+        anchored: the state begins with the channels, in units of `std` around `mean`.
+        units: hidden layers of the head's perceptron.
+        mean: (channels,) training mean, scaled units.
+        std: (channels,) training standard deviation, scaled units.
+    """
+
+    channels: int
+    hidden_size: int
+    anchored: bool
+    units: tuple[int, ...]
+    mean: Tensor
+    std: Tensor
+
+
+class Head(nn.Module):
+    """Base class of heads. A head of one's own overrides `decode`, and `loss` where it differs.
+
+    Args:
+        shape: what it is made for.
+
+    Attributes:
+        size: numbers per row that a decoder of this head has.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, shape: HeadShape) -> None:
+        super().__init__()
+        self.channels, self.hidden_size = shape.channels, shape.hidden_size
+        self.anchored = shape.anchored
+        self.register_buffer("mean", shape.mean, persistent=False)
+        self.register_buffer("std", shape.std, persistent=False)
+
+    def decode(self, state: Tensor) -> Prediction:
+        """(..., state_size) states to a prediction of (..., channels) in scaled units."""
+        raise NotImplementedError(f"{type(self).__name__} must define decode")
+
+    def loss(self, prediction: Prediction, target: Tensor, mask: Tensor | None) -> Tensor:
+        """Mean squared error over the entries that count.
+
+        Args:
+            prediction: of (batch, rows, channels).
+            target: (batch, rows, channels) scaled units; any finite number where it is not known.
+            mask: (batch, rows, channels) 1.0 where the target counts, else 0.0; None: all count.
+        """
+        if mask is None:
+            return mse_loss(prediction.mean, target)
+        squared = (prediction.mean - target).square()
+        return (squared * mask).sum() / mask.sum().clamp_min(1)
+
+    @property
+    def layers(self) -> tuple[tuple[Tensor, Tensor], ...]:
+        """Weight and bias of each layer of the decoder; empty where the state is read as it is."""
+        return ()
+
+    def hidden(self, state: Tensor) -> Tensor:
+        """(..., hidden) h of a state."""
+        first = self.channels if self.anchored else 0
+        return state[..., first : first + self.hidden_size]
+
+    def held(self, state: Tensor) -> Tensor:
+        """(..., channels) the channels of an anchored state, in scaled units."""
+        return state[..., : self.channels] * self.std + self.mean
+
+
+class Point(Head):
+    """The expected value alone, trained on the mean squared error.
+
+    An anchored state holds the prediction itself. Otherwise a perceptron of h gives it.
+    """
+
+    def __init__(self, shape: HeadShape) -> None:
+        super().__init__(shape)
+        self.decoder = None
+        if not shape.anchored:
+            self.decoder = Perceptron((shape.hidden_size, *shape.units, shape.channels), "tanh")
+
+    @property
+    def layers(self) -> tuple[tuple[Tensor, Tensor], ...]:
+        """Weight and bias of each layer of the decoder; empty for an anchored state."""
+        return () if self.decoder is None else self.decoder.layers
+
+    def decode(self, state: Tensor) -> Prediction:
+        """(..., state_size) to a prediction of (..., channels)."""
+        if self.decoder is None:
+            return Prediction(self.held(state))
+        return Prediction(perceptron(self.decoder.layers, self.hidden(state), "tanh"))
+
+
+class Gaussian(Head):
+    """A mean and a standard deviation per channel, trained on the negative log-likelihood.
+
+    The loss is that of a normal distribution, without its constant: log s + (x - m)^2 / (2 s^2).
+    """
+
+    SMALLEST = 1e-4
+    """Least standard deviation, scaled units: the likelihood of a constant channel is bounded."""
+
+    def __init__(self, shape: HeadShape) -> None:
+        super().__init__(shape)
+        width = shape.channels if shape.anchored else 2 * shape.channels
+        self.decoder = Perceptron((shape.hidden_size, *shape.units, width), "tanh")
+
+    def decode(self, state: Tensor) -> Prediction:
+        """(..., state_size) to means and standard deviations of (..., channels)."""
+        decoded = perceptron(self.decoder.layers, self.hidden(state), "tanh")
+        if self.anchored:
+            mean, raw = self.held(state), decoded
+        else:
+            mean, raw = decoded[..., : self.channels], decoded[..., self.channels :]
+        return Prediction(mean, softplus(raw) * self.std + self.SMALLEST)
+
+    def loss(self, prediction: Prediction, target: Tensor, mask: Tensor | None) -> Tensor:
+        """Mean negative log-likelihood over the entries that count, without its constant."""
+        assert prediction.scale is not None
+        each = torch.log(prediction.scale)
+        each = each + 0.5 * ((target - prediction.mean) / prediction.scale).square()
+        if mask is None:
+            return each.mean()
+        return (each * mask).sum() / mask.sum().clamp_min(1)
+
+
+HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
+"""What `Gaussian.loss` leaves out of the negative log-likelihood of one entry."""
+
+HEADS: Registry[type[Head]] = Registry("head", group="offbeat.heads")
+"""Heads by the name that `ModelConfig.head` takes."""
+
+HEADS.register("point", Point)
+HEADS.register("gaussian", Gaussian)
