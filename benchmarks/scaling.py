@@ -21,7 +21,7 @@ from common import machine, synthetic, write
 
 import offbeat as ob
 from offbeat.kernels import cpu
-from offbeat.training import Examples, threads_for
+from offbeat.training import Examples
 
 BASE: dict[str, Any] = {"batch": 50, "rows": 100, "hidden": 15, "units": 100, "observed": 0.3}
 SWEEPS: dict[str, list[Any]] = {
@@ -50,7 +50,7 @@ def step_of(data: ob.Dataset, name: str, **options: Any) -> Callable[[], None]:
     index = torch.arange(len(examples))
 
     def step() -> None:
-        with threads_for(model):
+        with model.threads():
             model.zero_grad()
             examples.loss(model, index, None).backward()
 

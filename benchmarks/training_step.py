@@ -23,7 +23,7 @@ from peers import JaxContestant, TorchContestant, facts_of
 import offbeat as ob
 from offbeat import kernels
 from offbeat.run import RunState, flat_parameters
-from offbeat.training import Examples, threads_for, train_step
+from offbeat.training import Examples, train_step
 
 MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
 
@@ -49,7 +49,7 @@ def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Contestant:
     def around() -> ExitStack:  # as `fit` enters once for all of a training
         stack = ExitStack()
         stack.enter_context(kernels.use(body))
-        stack.enter_context(threads_for(model))
+        stack.enter_context(model.threads())
         return stack
 
     return Contestant(step, around)

@@ -76,7 +76,7 @@ def median_gap(model: Model) -> float:
 
 
 def decoded(model: Model, h: Tensor) -> Tensor:
-    weights, biases = model.decoder.weights, model.decoder.biases  # type: ignore[union-attr]
+    weights, biases = model.head.decoder.weights, model.head.decoder.biases  # type: ignore[union-attr]
     return weights[1] @ torch.tanh(weights[0] @ h + biases[0]) + biases[1]
 
 
@@ -126,7 +126,7 @@ def states_of(model: Model, data: Dataset) -> tuple[Tensor, Tensor, Tensor]:
         output = model(batch)
         with kernels.use("reference"):
             reference = model(batch)
-    for name in ("predictions", "before", "after"):
+    for name in ("mean", "before", "after"):
         assert error(getattr(output, name), getattr(reference, name)) < 1e-13, name
     return output.mean[0], output.before[0], output.after[0]
 
@@ -560,6 +560,8 @@ def test_anchored_is_the_loop_of_innovations_with_x_set_where_observed(decay: st
     std = torch.tensor(model.statistics.std, dtype=torch.float64)
     model.mean.copy_(mean)
     model.std.copy_(std)
+    model.head.mean.copy_(mean)
+    model.head.std.copy_(std)
     cell = model.cell
     u_z, u_r, u_h = cell.recurrent.chunk(3)  # type: ignore[union-attr]
     x, h = model.start.detach(), torch.zeros(4).double()  # type: ignore[union-attr]
@@ -712,7 +714,7 @@ def test_a_prediction_is_read_from_the_state_on_arrival_or_after_the_row_before(
         start = model.empty_state(1).state
         states = before if readout == "target" else torch.cat([start, after[:-1]])
         with torch.no_grad():
-            assert torch.equal(got, model.read(states))
+            assert torch.equal(got, model.head.decode(states).mean)
 
 
 # --- gradients ------------------------------------------------------------------------------------
@@ -867,7 +869,7 @@ def test_weights_of_the_thesis_start_at_a_tenth_of_a_normal_and_biases_at_0(name
         if part is not None:
             assert bool((part.weight > 0).all()), "a negative weight of (26) gets no gradient"
     assert model.hidden_size == 15
-    assert [w.shape for w in model.decoder.weights] == [(100, 15), (14, 100)]  # type: ignore[union-attr]
+    assert [w.shape for w in model.head.decoder.weights] == [(100, 15), (14, 100)]  # type: ignore[union-attr]
     if name.startswith("ode"):
         shapes = [(100, 15), (100, 100), (100, 100), (100, 100), (15, 100)]
         assert [w.shape for w in model.field.weights] == shapes  # type: ignore[union-attr]
@@ -896,7 +898,7 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
         ({"hidden_size": True}, "hidden_size must be an integer"),
         ({"decoder_units": (5, 0)}, "decoder_units must be a list of layer sizes"),
         ({"field_units": 7}, "field_units must be a list of layer sizes"),
-        ({"cell": "grru"}, "unknown model option cell 'grru'.*did you mean 'gru'"),
+        ({"cell": "grru"}, "unknown cell 'grru'.*did you mean 'gru'"),
         ({"solver": "rk45"}, "unknown model option solver.*dopri5"),
         ({"activation": "relu"}, "expected one of: silu, tanh"),
         ({"decay": "yes"}, "unknown model option decay 'yes'"),
@@ -943,13 +945,7 @@ def test_an_unknown_model_is_refused_with_the_choices() -> None:
 def test_a_model_built_from_an_open_config_says_what_is_open() -> None:
     model = make_model("gru", dataset(2), **SMALL)
     with pytest.raises(InputError, match="left open: hidden_size"):
-        Model(
-            replace(model.config, hidden_size=None),
-            model.statistics,
-            scaler=model.scaler,
-            names=model.names,
-            units=model.units,
-        )
+        Model(replace(model.config, hidden_size=None), model.data)
 
 
 def test_channels_that_are_not_the_models_are_refused() -> None:
@@ -993,5 +989,5 @@ def test_a_carry_without_a_generator_cannot_feed_itself() -> None:
     model = small_model("gru", self_feeding=0.5)
     batch = model.batch(sample())
     carry = replace(model.empty_state(1), generator=None)
-    with pytest.raises(InputError, match="the carry needs a generator"):
+    with pytest.raises(InputError, match="give a generator"):
         model(batch, past=carry)

@@ -289,6 +289,7 @@ class Protocol:
             optimizer=self.anchored_optimizer if own else self.optimizer,
             learning_rate=self.anchored_learning_rate if own else self.learning_rate,
             seed=run.seed_draw,
+            keep="last",
             **(anchored if own else {}),
         )
 

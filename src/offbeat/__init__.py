@@ -37,10 +37,20 @@ if TYPE_CHECKING:
     from offbeat.evaluation import Evaluation, evaluate
     from offbeat.export.exporter import export_onnx
     from offbeat.export.runner import OnnxStream
+    from offbeat.kernels.backends import register_backend
     from offbeat.metrics import Score, Scores, row_0_constant
+    from offbeat.models.base import BaseModel, DataInfo
     from offbeat.models.checkpoint import load_model, save_model
     from offbeat.models.model import Model
-    from offbeat.models.zoo import THESIS_MODELS, make_model, thesis_config, train_config
+    from offbeat.models.zoo import (
+        THESIS_MODELS,
+        list_models,
+        make_model,
+        register_model,
+        thesis_config,
+        train_config,
+    )
+    from offbeat.parts import Prediction, register_part
     from offbeat.stream.options import StreamOptions
     from offbeat.stream.stream import Stream
     from offbeat.sweeps.running import SweepResult
@@ -50,13 +60,16 @@ if TYPE_CHECKING:
 __version__ = "0.2.0.dev0"
 
 _HOMES = {
+    "BaseModel": "models.base",
     "Batch": "data.batch",
     "Comparison": "comparison",
+    "DataInfo": "models.base",
     "Dataset": "data.trajectory",
     "Evaluation": "evaluation",
     "FitResult": "training",
     "Model": "models.model",
     "OnnxStream": "export.runner",
+    "Prediction": "parts",
     "Scaler": "data.scaler",
     "Score": "metrics",
     "Scores": "metrics",
@@ -79,6 +92,7 @@ _HOMES = {
     "impute": "answers.impute",
     "inspect": "data.inspection",
     "last_values": "data.batch",
+    "list_models": "models.zoo",
     "load": "data.store",
     "load_model": "models.checkpoint",
     "load_two_sided": "answers.impute",
@@ -87,6 +101,9 @@ _HOMES = {
     "predict": "answers.predict",
     "read": "data.readers",
     "read_runs": "comparison",
+    "register_backend": "kernels.backends",
+    "register_model": "models.zoo",
+    "register_part": "parts",
     "register_reader": "data.readers",
     "register_robot": "data.robots",
     "register_writer": "data.writers",
@@ -108,8 +125,10 @@ _HOMES = {
 
 __all__ = [
     "THESIS_MODELS",
+    "BaseModel",
     "Batch",
     "Comparison",
+    "DataInfo",
     "Dataset",
     "DivergenceError",
     "Evaluation",
@@ -121,6 +140,7 @@ __all__ = [
     "ModelConfig",
     "OffbeatError",
     "OnnxStream",
+    "Prediction",
     "Scaler",
     "Score",
     "Scores",
@@ -144,6 +164,7 @@ __all__ = [
     "impute",
     "inspect",
     "last_values",
+    "list_models",
     "load",
     "load_model",
     "load_two_sided",
@@ -152,6 +173,9 @@ __all__ = [
     "predict",
     "read",
     "read_runs",
+    "register_backend",
+    "register_model",
+    "register_part",
     "register_reader",
     "register_robot",
     "register_writer",

@@ -178,13 +178,13 @@ def _part(dataset: Dataset) -> dict[str, Any]:
 
 
 _WORDS = {
-    "model": "model options",
-    "training": "training options",
-    "scaler": "scaler",
-    "statistics": "means, scales or gaps of the training set",
-    "initial_weights": "initial weights (the seed or the model differs)",
-    "train": "training set",
-    "validation": "validation set",
+    "model": "the options of the model",
+    "training": "the options of the training",
+    "scaler": "the scales of the channels",
+    "statistics": "the means, scales or gaps of the training set",
+    "initial_weights": "the initial weights",
+    "train": "the trajectories of the training set",
+    "validation": "the trajectories of the validation set",
 }
 """What the parts of an identity are called in messages."""
 
@@ -252,8 +252,8 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
         then = kept["identity"].get(part)
         if then != now:
             raise InputError(
-                f"{folder} holds a run with another {_WORDS[part]}{_difference(then, now)}; give "
-                "the same, or another folder"
+                f"{folder} holds another run: {_WORDS[part]} differ{_difference(then, now)}; give "
+                "the same as then, or another folder"
             )
     model.load_state_dict(weights)
     prefix = "optimizer."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -117,7 +118,8 @@ class Batch:
         """The trajectories at these positions, trimmed to the longest of them."""
         valid = self.valid[index]
         rows = int(valid.sum(dim=1).max())
-        return replace(self, **{k: v[index][:, :rows] for k, v in self._tensors()})
+        cut: dict[str, Any] = {k: v[index][:, :rows] for k, v in self._tensors()}
+        return replace(self, **cut)
 
     @property
     def targets(self) -> Tensor:
@@ -157,7 +159,8 @@ class Batch:
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Batch:
         """Moves all tensors, and casts `values`; times stay float64."""
-        batch = replace(self, **{k: v.to(device) for k, v in self._tensors()})
+        moved: dict[str, Any] = {k: v.to(device) for k, v in self._tensors()}
+        batch = replace(self, **moved)
         return batch if dtype is None else replace(batch, values=batch.values.to(dtype))
 
 

@@ -202,16 +202,16 @@ class StreamStep(nn.Module):
         return y[:, : x.shape[1]], y[:, x.shape[1] :]
 
     def _field(self, y: Tensor) -> Tensor:
-        layers: Layers = self.model.field.layers if self.model.field is not None else ()
+        layers: Layers = getattr(self.model.field, "layers", ())
         return perceptron(layers, y, self.model.spec.activation)
 
     def _read(self, state: Tensor) -> Tensor:
         """The prediction in scaled units."""
         model = self.model
         x, h, _ = self._split(state)
-        if model.decoder is None:
+        if not model.head.layers:
             return x * model.std + model.mean
-        return perceptron(model.decoder.layers, h, "tanh")
+        return perceptron(model.head.layers, h, "tanh")
 
     def _updated(
         self, state: Tensor, gates: Tensor, update: Tensor, values: Tensor, mask: Tensor

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from offbeat.kernels import backend, cpu
+from offbeat.kernels import backend, choose, cpu
 from offbeat.models.model import Model
+from offbeat.parts import Point
 from offbeat.parts.decay import TrainableDecay
 from offbeat.stream.engine import Arrays, Engine
 from offbeat.stream.torch_engine import TorchEngine
@@ -32,15 +33,14 @@ class CpuEngine(Engine):
         self._fraction = float(config.self_feeding or 0.0)
         limit, statistics = float(config.gap_limit or 1), model.statistics
         decoder, decoder_weights = [], None
-        if model.decoder is not None:
-            layers = model.decoder.layers
+        if layers := model.head.layers:
             decoder = [layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers)]
             decoder_weights = _flat([t for layer in layers for t in layer])
         with torch.no_grad():
             self._live = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")(
                 spec=cpu.compiled_spec(spec),
                 instruction_set=backend()[0],
-                weights=_flat(list(model.scan_weights().tensors())),
+                weights=_flat(list(model.scan_parts().tensors())),
                 mean=model.mean.numpy(),
                 std=model.std.numpy(),
                 decoder=decoder,
@@ -68,7 +68,12 @@ class CpuEngine(Engine):
         Args:
             model: any.
         """
-        return None if model.runs_compiled() else "its scan does not run in compiled code here"
+        choice = choose(model.spec, model.dtype, model.device)
+        if choice.backend.name != "cpu":
+            return f"its scan runs in {choice.backend.name} here ({choice.reason})"
+        if type(model.head) is not Point:
+            return "its head is not point"
+        return "it has actions" if model.acts else None
 
     @property
     def dtype(self) -> np.dtype[Any]:

@@ -27,7 +27,7 @@ class _State:
 
 
 class TorchEngine(Engine):
-    """The reference: `model(row, carry=...)`.
+    """The reference: `model(row, past=...)`.
 
     Args:
         model: its weights are used as they are when a row comes.
@@ -69,7 +69,7 @@ class TorchEngine(Engine):
         )
         try:
             with torch.inference_mode():
-                self._carry = self._model(row, carry=self._carry).carry
+                self._carry = self._model(row, past=self._carry).past
         except Exception:
             self._take(before)
             raise
@@ -93,7 +93,7 @@ class TorchEngine(Engine):
         if carry.generator is not None:  # it acts after the prediction
             carry = replace(carry, generator=torch.Generator())
         with torch.inference_mode():
-            predicted: Tensor = self._model(asked, carry=carry).mean
+            predicted: Tensor = self._model(asked, past=carry).mean
             return predicted[:, 0].double().numpy()
 
     def save(self, slot: int) -> None:

@@ -15,7 +15,7 @@ from offbeat.config import TrainConfig
 from offbeat.data.scaler import Scaler
 from offbeat.data.store import load
 from offbeat.errors import OffbeatError
-from offbeat.models.zoo import make_model
+from offbeat.models.zoo import make_model, recipe_of
 from offbeat.run import EpochRecord
 from offbeat.sweeps.engines import base
 from offbeat.sweeps.engines.local import LocalEngine
@@ -85,7 +85,7 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
         return
     waiting, running = list(jobs), list[str]()
     engine = LocalEngine(workers, 1)
-    total = sum(job.training.epochs for job in jobs)
+    total = sum(recipe_of(job.name, job.training, validated=True).epochs for job in jobs)
     with tqdm(
         total=total, desc="training", unit="epoch", disable=None if progress else True
     ) as bar:
