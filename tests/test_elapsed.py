@@ -1,4 +1,4 @@
-"""ElapsedTimes and gaps at every row against a plain loop, split anywhere, with empty rows anywhere."""
+"""Elapsed times and gaps at every row against a plain loop, split anywhere, empty rows anywhere."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from model_helpers import TICK, rows_of
 from numpy.typing import NDArray
 
 from offbeat import Batch, Trajectory
-from offbeat.models.elapsed import ElapsedTimes, RecurrentState
+from offbeat.models.elapsed import ElapsedTimes, RecurrentState, elapsed_times
 
 FAR = 1e6
 NAMES = [field.name for field in fields(ElapsedTimes)]
@@ -75,7 +75,7 @@ def by_hand(
     def since_observed(time: float | None) -> float:
         return 0.0 if latest is None or time is None else min(time - latest, limit)
 
-    def channel_elapsed_times(time: float | None) -> list[float]:
+    def channel_times(time: float | None) -> list[float]:
         if start is None or time is None:
             return [0.0] * one.channels
         lost = 0.0 if latest is None else max(time - latest - limit, 0.0)
@@ -88,8 +88,8 @@ def by_hand(
         found["elapsed"].append(since_observed(time))
         found["elapsed_before"].append(since_observed(before))
         found["gap"].append(since_observed(time) - since_observed(before))
-        found["delta"].append(channel_elapsed_times(time))
-        found["delta_before"].append(channel_elapsed_times(before))
+        found["delta"].append(channel_times(time))
+        found["delta_before"].append(channel_times(before))
         found["last"].append(list(last))
         found["observed"].append(bool(mask.any()))
         found["first"].append(bool(mask.any()) and not seen)
@@ -154,7 +154,7 @@ def test_rows_with_nothing_observed_change_nothing_at_other_rows(case: Case) -> 
 
 
 @given(cases())
-def test_padding_is_a_pause_in_which_nothing_elapsed_times(case: Case) -> None:
+def test_padding_is_a_pause_in_which_nothing_elapses(case: Case) -> None:
     got, _ = measured(case, case.batch)
     for i, one in enumerate(case.trajectories):
         assert not got.observed[i, one.rows :].any()

@@ -30,7 +30,7 @@ TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
 
 def agree(case: Problem, body: str, *, keep: bool = True, strict: bool = True) -> None:
-    """The compiled backend runs this very call, or raises; its results equal the reference backend's.
+    """The compiled backend runs this very call, or raises; it equals the reference backend.
 
     Where it is not `strict`, shapes are random, and a tensor may be all cancellation: its largest
     entry counts as at least a thousandth of all tensors' largest, and in single precision it is
@@ -312,7 +312,8 @@ def test_row_by_row_gives_the_bits_of_the_whole_sequence(name: str, body: str) -
 def cut(rows: StepInputs, lanes: slice, at: slice) -> StepInputs:
     """Some rows of some trajectories; none of them is padding."""
     changed: dict[str, Any] = {"length": None}
-    for name in ("gap", "update", "values", "mask", "time_input", "updated", "decay_start", "decay_end",
+    for name in ("gap", "update", "values", "mask", "time_input", "updated", "decay_start",
+                 "decay_end",
                  "delta", "last"):  # fmt: skip
         value = getattr(rows, name)
         changed[name] = None if value is None else value[lanes, at]

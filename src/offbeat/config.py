@@ -47,13 +47,14 @@ class ModelConfig:
         input_decay: gamma_x, last values that fade to the training mean (equation 27).
         anchored: the state holds the channels themselves, and an observation sets them.
         update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
-        time_input: what tells a plain cell how old its knowledge is: `elapsed` since the last
-            observed row, `delta` per channel (equation 25), `gap` since the row before, or `none`.
-        time_input_unit: of that age: the median `gap` of training, or the `longest` age met there, so
-            that it is at most 1 in training. ElapsedTimes that count many gaps are large beside the values,
-            and can take longer to learn from.
-        self_feeding: share of rows at which the cell's input is the model's own decoded
-            prediction in place of the observed values (one coin per row for the whole batch,
+        time_input: the time that a plain cell is given: `elapsed` since the last observed row,
+            `delta` since each channel's last observation (equation 25), `gap` since the row before,
+            or `none`.
+        time_input_unit: of that time: the median `gap` of training, or the `longest` time met
+            there, so that it is at most 1 in training. Times of many gaps are large beside the
+            values, and can take longer to learn from.
+        self_feeding: fraction of rows at which the cell's input is the model's own decoded
+            prediction in place of the observed values (one draw per row for the whole batch,
             row 0 excepted), in training and in testing. A fault of public code, kept by name.
         readout: `target`, the state is carried to the time asked for; `last_row`, the prediction
             is decoded from the state after the row before (the thesis' protocol).
@@ -120,7 +121,7 @@ class ModelConfig:
                 "a list of layer sizes, each at least 1",
             )
         _check(self, "gap_limit", lambda v: 1 <= v < math.inf, "at least 1, and finite")
-        _check(self, "self_feeding", lambda v: 0 <= v <= 1, "a share from 0 to 1")
+        _check(self, "self_feeding", lambda v: 0 <= v <= 1, "a fraction from 0 to 1")
         if self.self_feeding and self.anchored:
             raise InputError(
                 "self_feeding is an option of the plain recurrent models; an anchored model "

@@ -51,7 +51,7 @@ class Evaluation:
         return {name: value**0.5 * abs(scale) for name, value, scale in scales}
 
     def in_units(self) -> ChannelScores:
-        """The RMSE of every predictor after the first observation, per channel in its unit, and who is best."""
+        """RMSE after the first observation of every predictor, per channel in its unit."""
         return ChannelScores(
             "one step ahead",
             self.names,

@@ -102,7 +102,8 @@ class ScoreSums:
 
     Args:
         channels: number of channels.
-        gap_unit: s; times since observation are grouped at 1, 2, 4, 8, ... times this. None leaves `by_gap` empty.
+        gap_unit: s; times since observation are grouped at 1, 2, 4, 8, ... times this. None
+            leaves `by_gap` empty.
     """
 
     def __init__(self, channels: int, *, gap_unit: float | None = None) -> None:
@@ -192,7 +193,7 @@ def _shown(rmse: float) -> str:
 
 
 def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None) -> str:
-    """A plain-text table of scores, one line per predictor, best score after the first observation first.
+    """A plain-text table of scores, one line per predictor, the best one first.
 
     Args:
         rows: scores by predictor.

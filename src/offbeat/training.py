@@ -352,8 +352,8 @@ def _close_epoch(
         and scores.after_first_row.count
     ):
         raise DivergenceError(
-            f"the validation MSE turned to {scores.after_first_row.mse} after epoch {state.epoch + 1}; "
-            "the last good checkpoint is kept: lower the learning rate, or clip gradients"
+            f"the validation MSE turned to {scores.after_first_row.mse} after epoch "
+            f"{state.epoch + 1}; the last good checkpoint is kept: lower the learning rate, or clip gradients"
         )
     nan = math.nan
     record = EpochRecord(

@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 
 class TrainableDecay(nn.Module):
-    """gamma_h = exp(-max(0, W delta + b)) of equation 26, from the time since observation of each channel.
+    """gamma_h = exp(-max(0, W delta + b)) of equation 26, from times since observation.
 
     Args:
         channels: number of channels.
