@@ -353,7 +353,8 @@ def _close_epoch(
     ):
         raise DivergenceError(
             f"the validation MSE turned to {scores.after_first_row.mse} after epoch "
-            f"{state.epoch + 1}; the last good checkpoint is kept: lower the learning rate, or clip gradients"
+            f"{state.epoch + 1}; the last good checkpoint is kept: lower the learning rate, or "
+            "clip gradients"
         )
     nan = math.nan
     record = EpochRecord(

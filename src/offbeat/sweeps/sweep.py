@@ -13,7 +13,7 @@ from offbeat.data.scaler import SCALERS, Scaler
 from offbeat.data.splits import apply_split
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
-from offbeat.models.zoo import train_config
+from offbeat.models.zoo import recipe_of, train_config
 from offbeat.sweeps.fingerprint import fingerprint
 from offbeat.sweeps.plan import Parts, Plan, Run
 from offbeat.sweeps.provenance import provenance
@@ -69,9 +69,9 @@ class SweepPlan(Plan):
         """Repeat by repeat, so that a part of a sweep can be compared."""
         seeds = [(i, self.split.seed + i) for i in range(self.repeats)]
         return tuple(
-            SweepRun(label, i, training.epochs, seed, seed)
+            SweepRun(label, i, recipe_of(model.name, training, validated=True).epochs, seed, seed)
             for i, seed in seeds
-            for label, _, training in self.choices
+            for label, model, training in self.choices
         )
 
     def settings(self) -> Mapping[str, Any]:
