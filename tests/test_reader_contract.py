@@ -13,7 +13,8 @@ import pytest
 from log_writers import OPTIONS, WRITERS
 from real_logs import evo, shared
 
-from offbeat.data.readers import OPTIONS as CLEANING, READERS, read
+from offbeat.data.readers import OPTIONS as CLEANING
+from offbeat.data.readers import READERS, read
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError
 
