@@ -20,14 +20,14 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.mark.parametrize("body", cpu.instruction_sets() or ["none"])
+@pytest.mark.parametrize("name", cpu.instruction_sets() or ["none"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_every_row_of_a_stream_has_the_bits_of_the_batch(
-    variant: str, dtype: torch.dtype, body: str
+    variant: str, dtype: torch.dtype, name: str
 ) -> None:
     """Of a batch with mates and padding; the state is exported, lost and restored on the way."""
-    with kernels.use(body):
+    with kernels.use(name):
         model = build(variant, dtype)
         if model.backend()[0] == "reference":
             pytest.skip("its solver or gradient has no compiled backend")
@@ -89,7 +89,7 @@ def test_a_state_moves_between_the_engines() -> None:
     assert all(np.array_equal(back[k], kept[k], equal_nan=kept[k].dtype != bool) for k in kept)
 
 
-def test_a_stream_of_a_model_without_fused_body_runs_in_torch() -> None:
+def test_a_stream_of_a_model_without_compiled_backend_runs_in_torch() -> None:
     model = build("ode_rnn-dopri5", torch.float64)
     assert model.backend()[0] == "reference"
     stream = ob.Stream(model)
