@@ -264,7 +264,7 @@ class TestTheUnion:
             assemble([])
 
     def test_names_and_units_must_agree(self):
-        with pytest.raises(FileFormatError, match=r"'a\.x' stands twice"):
+        with pytest.raises(FileFormatError, match=r"have the name 'a\.x'"):
             built(signal([0], [1.0]), signal([0], [1.0], [2.0], name="a", channels=("y", "x")),
                   signal([0], [1.0], name="", channels=("a.x",)))  # fmt: skip
         with pytest.raises(FileFormatError, match="is in 'm' here and in 'cm' there"):

@@ -59,7 +59,7 @@ class TestCsvOfOtherPrograms:
         dataset = read(text_file(",time,x,\n0,0,1,\n1,1,2,\n"))
         assert (dataset.names, dataset[0].values.tolist()) == (("x",), [[1.0], [2.0]])
         assert (
-            "the last column has no name and no cell in the first lines; it is left out"
+            "the last column has no name and no field in the first lines; it is left out"
             in notes_of(dataset)
         )
         refused(text_file("time,x,\n0,1,\n1,2,3\n"), "no name for column 2")
@@ -293,7 +293,7 @@ class TestParquetOfOtherPrograms:
             ({"x": [1.0]}, "no column of times"),
             ({"time": [0.0]}, "no channels"),
             ({"time": pa.array([], pa.float64()), "x": pa.array([], pa.float64())}, "no rows"),
-            ({"time": [0.0, None], "x": [1.0, 2.0]}, "empty cell in row 1, column 'time'"),
+            ({"time": [0.0, None], "x": [1.0, 2.0]}, "empty value in row 1, column 'time'"),
             ({"time": [0.0, 1.0], "q": [[1.0], [1.0, 2.0]]}, "lists of 2 lengths in column 'q'"),
             ({"time": [0.0], "q": pa.array([[]], pa.list_(pa.float64()))}, "no lists with a value"),
             ({"time": [0.0], "q": pa.array([None], pa.list_(pa.int8()))}, "no lists with a value"),
@@ -342,7 +342,7 @@ class TestParquetOfOtherPrograms:
         for empty in (None, ""):
             labels = pa.array(["a", "a", "b", empty]).dictionary_encode()
             columns = {"time": [0.0, 1.0, 2.0, 3.0], "episode": labels, "x": [1.0] * 4}
-            refused(self.written(tmp_path, columns), "empty cell in row 3, column 'episode'")
+            refused(self.written(tmp_path, columns), "empty value in row 3, column 'episode'")
 
     def test_with_a_column_twice_is_an_error_of_one_line(self, tmp_path):
         path, column = tmp_path / "walk.parquet", pa.array([0.0, 1.0])

@@ -46,7 +46,7 @@ def test_a_trajectory_cannot_be_changed():
         ({"times": [], "values": np.zeros((0, 2))}, "empty: 0 rows"),
         ({"observed": np.ones((3, 2), bool)}, "True at row 1, channel 'channel_0', where the"),
         ({"observed": np.ones((3, 2))}, "observed must be bool"),
-        ({"names": ("a", "a")}, "'a' stands twice"),
+        ({"names": ("a", "a")}, "have the name 'a'"),
         ({"names": ("a",)}, "1 names, 2 units and 2 roles for 2 channels"),
         ({"units": ("m",)}, "2 names, 1 units"),
         ({"roles": ("state",)}, "2 units and 1 roles"),

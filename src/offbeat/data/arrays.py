@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def frozen(value: Any, dtype: Any) -> NDArray[Any]:
-    """Returns a read-only array that nobody else can write to; copies where that is needed.
+    """Returns a read-only array that nothing else can write to; copies where that is needed.
 
     Nothing is copied that is new (a list, another type of number) or that is read-only already,
     down to the array that owns the memory, such as a slice of a record's own array.

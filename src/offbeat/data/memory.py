@@ -1,7 +1,4 @@
-"""Whether there is memory for what a file holds, asked before any of it is read.
-
-Without the question, the system ends the process, and nothing says why.
-"""
+"""Checks that a file fits into memory before it is read; else the system may end the process."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ def require_memory(path: Path, need: int, what: str, instead: str = "") -> None:
 def available_memory() -> int | None:
     """Bytes that this process can still take before the system ends it; None where unknown.
 
-    What the system has to give (Linux says it), and what is left of the limits of the control
+    What the system has left (on Linux), and what is left of the limits of the control
     groups, versions 1 and 2, that the process is in.
     """
     return min((*_of_system(), *_of_groups()), default=None)
@@ -89,9 +86,11 @@ def _of_groups() -> Iterator[int]:
             most, used = _number(folder / limit), _number(folder / usage)
             if most is not None and used is not None:
                 # The system drops copies of files before it ends a process.
-                said = _fields(folder / "memory.stat")
+                statistics = _fields(folder / "memory.stat")
                 kinds = ("active_file", "inactive_file")
-                files = sum(said.get(f"total_{kind}", said.get(kind, 0)) for kind in kinds)
+                files = sum(
+                    statistics.get(f"total_{kind}", statistics.get(kind, 0)) for kind in kinds
+                )
                 yield max(0, most - used + files)
             if folder == root:
                 break

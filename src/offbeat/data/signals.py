@@ -1,4 +1,4 @@
-"""What a reader hands over: a recording per file or episode, a signal per sensor, as logged."""
+"""What a reader gives: a recording per file or episode, a signal per sensor, as logged."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from offbeat.data.trajectory import ROLES
 from offbeat.errors import InputError, one_of
 
 KINDS = ("", "angle", "quaternion")
-"""What a channel can be, beyond a number."""
+"""Kinds of channels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """What one sensor, topic or table said, as it was logged: faults are still inside.
+    """The values of one sensor, topic or table, as they were logged.
+
+    Its arrays are handed over: they become those of trajectories, and read-only.
 
     Args:
         name: of the topic or table. Channels are called `name.channel` where several signals are
@@ -84,7 +86,7 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One file or one episode: signals on one clock, before any policy.
+    """One file or one episode: signals on one clock, as they were logged.
 
     Args:
         signals: what was logged; a signal may be empty.
@@ -92,9 +94,8 @@ class Recording:
         origin: where it came from, for messages and reports.
         time_unit: the unit that the file itself counts in, for reports: `s`, `ms`, `us`, `ns` or
             `100ns`.
-        notes: what is to be said aloud about how it was read, such as "stamps are row number /
-            fps".
-        clock_zero: what the file's clock shows at stamp 0, in `time_unit`, where the stamps do not
+        notes: what the reader had to assume or to leave out, such as "stamps are row number / fps".
+        clock_zero: the file's clock at stamp 0, in `time_unit`, where the stamps do not
             count from the clock's own zero because that would exceed an int64.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The one check that every file passes before any reader looks into it."""
+"""The check that every file passes before it is read."""
 
 from __future__ import annotations
 

@@ -198,7 +198,7 @@ def _described(
         )
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"the channel name {twice!r} stands twice{where}; names are unique")
+        raise InputError(f"two channels{where} have the name {twice!r}; names must be unique")
     for role in roles:
         one_of("role of a channel", role, ROLES)
     return names, units, roles

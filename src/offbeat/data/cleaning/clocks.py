@@ -57,8 +57,8 @@ def split_unit(name: str) -> tuple[str, str]:
 def time_unit_in(name: str) -> str | None:
     """The unit that the name of a time column says (`time_ms`, `t [ns]`), or None."""
     stem, unit = split_unit(name)
-    said = unit.casefold() or stem.casefold().rpartition("_")[2]
-    return _UNIT_OF.get(said) if unit or "_" in stem else None
+    text = unit.casefold() or stem.casefold().rpartition("_")[2]
+    return _UNIT_OF.get(text) if unit or "_" in stem else None
 
 
 def time_column_of(names: list[str]) -> str | None:
@@ -122,22 +122,22 @@ def state_time_unit(
         where: the file, for messages.
 
     Returns:
-        The unit, and what is to be said aloud: that it was found, and how to state it.
+        The unit, and notes: that it was found, and how to state it.
 
     Raises:
         InputError: the unit that is given is unknown, or the name says another one.
     """
-    said = time_unit_in(name)
+    named = time_unit_in(name)
     if given is not None:
         one_of("time unit", given, NANOSECONDS_PER)
-        if said not in (None, given):
+        if named not in (None, given):
             raise InputError(
-                f"{where}: the column {name!r} says that times are in {said}, time_unit says "
+                f"{where}: the column {name!r} says that times are in {named}, time_unit says "
                 f"{given}; leave time_unit out, or rename the column"
             )
         return given, ()
-    if said is not None:
-        return said, ()
+    if named is not None:
+        return named, ()
     found, why = find_time_unit(clock)
     if not why:
         return found, ()

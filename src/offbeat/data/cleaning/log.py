@@ -121,40 +121,40 @@ def upgraded(report: Mapping[str, Any]) -> dict[str, Any]:
 
 def sentences(cleaning: Mapping[str, Any]) -> list[str]:
     """A cleaning log as sentences, one for each kind of anomaly that was found."""
-    said: list[str] = list(cleaning["notes"])
+    lines: list[str] = list(cleaning["notes"])
     order, duplicates, jumps = cleaning["order"], cleaning["duplicates"], cleaning["clock_jumps"]
     if order["late"]:
         what = {"sort": "sorted", "drop": "dropped"}.get(order["option"], order["option"])
-        said.append(f"{_rows(order['late'])} came late and {_were(order['late'])} {what}")
+        lines.append(f"{_rows(order['late'])} came late and {_were(order['late'])} {what}")
     if duplicates["rows"]:
         how = {"mean": "the mean of the known values"}.get(
             duplicates["option"], f"the {duplicates['option']} known value"
         )
-        said.append(
+        lines.append(
             f"{_rows(duplicates['rows'])} had the time stamp of another row; {how} of each channel "
             "was kept"
         )
     if jumps["found"]:
         what = {"split": "each began a new episode"}.get(jumps["option"], "they were ignored")
-        said.append(f"the clock was set {jumps['found']} times; {what}")
+        lines.append(f"the clock was set {jumps['found']} times; {what}")
     outages = cleaning["outages"]
     if outages["found"]:
         count, longest = outages["found"], f"{outages['longest_s']:.3g} s"
         what = f"{count} outages, the longest of {longest}, each" if count > 1 else ""
-        said.append(
+        lines.append(
             f"{what or f'1 outage of {longest}'} began a new episode "
             f"(max_gap_s {outages['max_gap_s']})"
         )
     left = cleaning["left_out"]
     if left["episodes"]:
-        said.append(
+        lines.append(
             f"{left['episodes']} episodes of fewer than {left['min_rows']} rows were left out "
             f"({_rows(left['rows'])})"
         )
     if left["without_rows"]:
-        said.append(f"{left['without_rows']} recordings without a row were left out")
+        lines.append(f"{left['without_rows']} recordings without a row were left out")
     if cleaning["infinite"]["values"]:
-        said.append(f"{cleaning['infinite']['values']} infinite values count as missing")
+        lines.append(f"{cleaning['infinite']['values']} infinite values count as missing")
     repeated = cleaning["repeated"]
     if repeated["channels"]:
         done = (
@@ -162,25 +162,25 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
             if repeated["option"] == "mask"
             else "they were kept (repeated=mask masks them)"
         )
-        said.append(
+        lines.append(
             f"repeated values, of a sensor slower than the log, in "
             f"{listed(list(repeated['channels']))}; {done}"
         )
     turns = cleaning["angles"]["turns"]
     if turns:
-        said.append(
+        lines.append(
             f"{sum(turns.values())} jumps by a turn were removed from {listed(list(turns))}"
         )
     quaternions = cleaning["quaternions"]
     if any(quaternions[kind] for kind in ("flipped", "renormalised", "dropped")):
-        said.append(
+        lines.append(
             f"quaternions {listed(['/'.join(four) for four in quaternions['channels']])}: "
             f"{quaternions['flipped']} rows changed sign, {quaternions['renormalised']} had "
             f"another length than 1, {quaternions['dropped']} were none and are missing"
         )
     if cleaning["resample_hz"] is not None:
-        said.append(f"resampled at {cleaning['resample_hz']:g} Hz")
-    return said
+        lines.append(f"resampled at {cleaning['resample_hz']:g} Hz")
+    return lines
 
 
 def _rows(count: int) -> str:

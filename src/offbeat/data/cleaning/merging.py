@@ -73,7 +73,7 @@ class Channels:
         names = tuple(f"{s}.{c}" if several and s else c for s, c in columns)
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise FileFormatError(f"the channel name {twice!r} stands twice; names are unique")
+            raise FileFormatError(f"two channels have the name {twice!r}; names must be unique")
         if not names:
             raise FileFormatError("there is no channel to read, only times")
         for option, role in (("actions", "action"), ("exogenous", "exogenous")):

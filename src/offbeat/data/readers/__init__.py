@@ -22,7 +22,7 @@ from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.registry import Registry
 
 FOLDER = "/"
-"""Stands among the suffixes of a reader of folders; such a reader must have `recognises`."""
+"""The suffix of a reader of folders; such a reader must have `recognises`."""
 
 OPTIONS = tuple(field.name for field in fields(ReaderOptions))
 """The options that every format has whose reader gives recordings."""

@@ -16,7 +16,7 @@ from offbeat.errors import FileFormatError
 
 
 class NullCellError(Exception):
-    """A row has no time, or says not to which trajectory or channel it belongs."""
+    """A row has no time, or no label of its trajectory or channel."""
 
     def __init__(self, column: str, row: int) -> None:
         super().__init__(column, row)
@@ -40,7 +40,7 @@ def gather(
         FileFormatError: the time is of no type that counts.
         OverflowError: a time of decimals exceeds an int64 of nanoseconds.
     """
-    # Columns lie one after the other, so that each is filled and looked at in one stretch.
+    # Columns lie one after the other, so that each is filled and read as one block.
     values = np.empty((len(columns.channels), capacity))
     clocks: list[NDArray[Any]] = []
     labels = Coder() if columns.label else None
@@ -196,5 +196,5 @@ def _without_nulls(column: Any, name: str, before: int) -> Any:
 
 
 def line_error(path: Path, error: Any) -> FileFormatError:
-    """What Arrow says of a file, in one line."""
+    """An error of Arrow about a file, in one line."""
     return FileFormatError(f"{path}: {' '.join(str(error).split())}")

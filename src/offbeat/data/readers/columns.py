@@ -175,7 +175,7 @@ def _long_form(
 
 @dataclass(frozen=True, eq=False)
 class Coded:
-    """A column of texts: a number per row, and the texts that the numbers stand for."""
+    """A column of texts: a number per row, and the texts that the numbers mean."""
 
     codes: NDArray[np.int64]
     texts: list[str]
@@ -239,7 +239,7 @@ def recordings(
         path: for messages.
         columns: what they are.
         unit: of the clock.
-        notes: to be said aloud.
+        notes: of the recordings.
         table: the columns.
         shown: the unit that the file counts in, where the clock is in another one already.
 
@@ -305,7 +305,7 @@ def _groups(coded: Coded | None) -> list[tuple[str, Any]]:
         return []
     starts = np.flatnonzero(np.diff(codes, prepend=-1))
     met = codes[starts]
-    if len(np.unique(met)) == len(met):  # one stretch each: nothing needs to be copied
+    if len(np.unique(met)) == len(met):  # one run each: nothing needs to be copied
         ends = [*starts[1:], len(codes)]
         return [
             (coded.texts[code], slice(start, end))

@@ -66,7 +66,7 @@ def recordings(
         include_actions: whether the actions are read, too; their channels have the role `action`.
         mask: robomimic's name of a subset of the episodes, such as `train`.
         rate_hz: rows per second. By default that of the environment where the file says it; else
-            rows are taken to be 1 s apart, and that is said aloud.
+            rows are taken to be 1 s apart, and that is noted.
         time_unit: unit of an observation that is the time, where there is one.
 
     Yields:
@@ -142,19 +142,19 @@ def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:
 def _rate(
     root: Any, path: Path, given: float | None, *, robomimic: bool
 ) -> tuple[float, tuple[str, ...]]:
-    """Rows per second, and what is to be said about it."""
+    """Rows per second, and a note on them."""
     if given is not None:
         return given, (f"stamps are row number / {given:g} Hz, as rate_hz says",)
-    said = "robomimic" if robomimic else "Minari"
+    layout = "robomimic" if robomimic else "Minari"
     found = _control_hz(root) if robomimic else None
     if found is not None:
         return found, (
-            f"stamps are row number / {found:g} Hz, the environment's control_freq; {said} stores "
-            "no times",
+            f"stamps are row number / {found:g} Hz, the environment's control_freq; {layout} "
+            "stores no times",
         )
     return 1.0, (
-        f"rows are taken to be 1 s apart: {said} stores no times, and no rate stands in "
-        f"{path.name}; state it with rate_hz",
+        f"rows are taken to be 1 s apart: {layout} stores no times, and {path.name} has no "
+        "rate; state it with rate_hz",
     )
 
 
@@ -224,9 +224,9 @@ def _episode(
         )
     n = next(iter(rows.values()))
     if clock:
-        unit, said = state_time_unit(time_unit, clock[0], clock[1], str(path))
+        unit, more = state_time_unit(time_unit, clock[0], clock[1], str(path))
         stamps, zero = to_nanoseconds(clock[1], unit)
-        notes = (f"stamps are the observation {clock[0]!r}", *said)
+        notes = (f"stamps are the observation {clock[0]!r}", *more)
     else:
         unit, zero = "s", 0
         stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
@@ -289,7 +289,7 @@ def _refuse_objects(dataset: Any, path: Path) -> None:
 
 
 def _what(dataset: Any) -> str:
-    """In a word, what an array holds that is none of numbers."""
+    """The kind of an array that holds no numbers, for messages."""
     import h5py
 
     if dataset.dtype.kind in "SU" or h5py.check_string_dtype(dataset.dtype) is not None:
@@ -315,7 +315,7 @@ def _kinds(name: str, channels: list[str]) -> list[str]:
 def _actions(
     episode: Any, path: Path, rows: int
 ) -> tuple[list[NDArray[np.float64]], list[str], tuple[str, ...]]:
-    """Values and names of the actions, one per row of the observations, and what is to be said."""
+    """Values and names of the actions, one per row of the observations, and notes."""
     if "actions" not in episode:
         return [], [], ("there are no actions",)
     parts: list[NDArray[np.float64]] = []

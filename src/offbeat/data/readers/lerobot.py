@@ -6,7 +6,7 @@ features, the rate and the pattern of the files' names. Version 2 has a Parquet 
 which file each one is in.
 
 LeRobot itself writes row number / fps into `timestamp`. Where a data set brings stamps of its own,
-in `timestamp` or in another column, those are taken; else the rows are on a grid, and that is said.
+in `timestamp` or in another column, those are taken; else rows are on a grid, which is noted.
 """
 
 from __future__ import annotations
@@ -148,8 +148,8 @@ class _Reading:
             )
         episode = self.table.slice(int(rows[0]), int(rows[-1] - rows[0]) + 1)
         if episode.num_rows != len(rows):
-            raise FileFormatError(f"{at.file}: the rows of episode {number} do not stand together")
-        stamps, zero, unit, said = self._stamps(episode, at.file)
+            raise FileFormatError(f"{at.file}: the rows of episode {number} are not consecutive")
+        stamps, zero, unit, notes = self._stamps(episode, at.file)
         alone = len(self.chosen) == 1
         features = [*self.chosen, *self.acted]
         named = [f.channels(alone=alone and f in self.chosen) for f in features]
@@ -165,22 +165,22 @@ class _Reading:
             label=str(number),
             origin=f"{self.info.root.name}, episode {number}",
             time_unit=unit,
-            notes=(*said, *self.notes),
+            notes=(*notes, *self.notes),
             clock_zero=zero,
         )
 
     def _stamps(
         self, episode: Any, file: Path
     ) -> tuple[NDArray[np.int64], int, str, tuple[str, ...]]:
-        """Nanoseconds, the clock at nanosecond 0, the column's unit, and what is to be said."""
+        """Nanoseconds, the clock at nanosecond 0, the column's unit, and notes."""
         fps = self.info.fps
         grid = np.rint(np.arange(episode.num_rows) * (1e9 / fps)).astype(np.int64)
         for name in self.clocks:
             clock = _raw(episode, name, file)
             unit = "s"
-            said: tuple[str, ...] = ()
+            notes: tuple[str, ...] = ()
             if name != "timestamp" or self.time_unit is not None:
-                unit, said = state_time_unit(
+                unit, notes = state_time_unit(
                     self.time_unit, name.rpartition(".")[2], clock, str(file)
                 )
             stamps, zero = to_nanoseconds(clock, unit)
@@ -188,7 +188,7 @@ class _Reading:
             near = 1_000 + grid // 1_000_000
             if self.given is None and (np.abs(stamps - stamps[:1] - grid) <= near).all():
                 continue
-            return stamps, zero, unit, (f"stamps are the column {name!r}", *said)
+            return stamps, zero, unit, (f"stamps are the column {name!r}", *notes)
         return grid, 0, "s", (f"stamps are row number / {fps:g} fps, no times were recorded",)
 
 

@@ -1,4 +1,4 @@
-"""What a LeRobot data set says of itself: features, files, episodes."""
+"""The metadata of a LeRobot data set: features, files, episodes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class Info:
         """Reads and checks it."""
         path = require_file(root / "meta" / "info.json")
         try:
-            said = json.loads(path.read_text(encoding="utf-8"))
+            found = json.loads(path.read_text(encoding="utf-8"))
             features = {
                 name: Feature(
                     name,
@@ -97,11 +97,11 @@ class Info:
                     tuple(int(n) for n in feature.get("shape") or (1,)),
                     _labels(feature),
                 )
-                for name, feature in said["features"].items()
+                for name, feature in found["features"].items()
             }
-            version, fps = str(said["codebase_version"]), float(said["fps"])
-            data_path = str(said["data_path"])
-            total, chunk = int(said["total_episodes"]), int(said.get("chunks_size", 1000))
+            version, fps = str(found["codebase_version"]), float(found["fps"])
+            data_path = str(found["data_path"])
+            total, chunk = int(found["total_episodes"]), int(found.get("chunks_size", 1000))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise FileFormatError(
                 f"{path} is not the info.json of a LeRobot data set ({error!r}); download it again"
@@ -118,7 +118,7 @@ class Info:
         return cls(root, version, fps, features, data_path, total, chunk)
 
     def chosen(self, columns: Sequence[str] | None) -> tuple[list[Feature], list[str]]:
-        """The features that become channels, and what is to be said about others."""
+        """The features that become channels, and notes on the others."""
         listed = names("columns", columns)
         if listed is not None:
             for name in listed:
@@ -151,8 +151,8 @@ class Info:
             try:
                 for line in require_file(path).read_text(encoding="utf-8").splitlines():
                     if line.strip():
-                        said = json.loads(line)
-                        lengths[int(said["episode_index"])] = int(said["length"])
+                        found = json.loads(line)
+                        lengths[int(found["episode_index"])] = int(found["length"])
             except (KeyError, TypeError, ValueError) as error:
                 raise FileFormatError(f"{path} is damaged ({error!r}); download it again") from None
         return {

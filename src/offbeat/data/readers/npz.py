@@ -35,7 +35,7 @@ def read_npz(
     channels: one of shape (rows,) is called like its array, the columns of one of shape (rows, k)
     `array.0`, `array.1`, ..., or as an array `names` of k texts says, where there is one matrix;
     `units` likewise. Or the times have shape (episodes, rows), and the others one axis more, too;
-    rows whose time is NaN are padding. Other arrays are left out, which is said aloud.
+    rows whose time is NaN are padding. Other arrays are left out, which is noted.
 
     Args:
         path: the file.
@@ -44,7 +44,7 @@ def read_npz(
             by default found by its name, see `LABEL_NAMES`.
         channels: the channels to read, in the order wanted; by default all.
         time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the array's name or type says,
-            else found by the numbers, which is said aloud, else `s`.
+            else found by the numbers, which is noted, else `s`.
         units: unit of a channel by its name.
 
     Returns:
@@ -131,7 +131,7 @@ def _check_size(path: Path) -> None:
         with zipfile.ZipFile(path) as file:
             size = sum(member.file_size for member in file.infolist())
     except (zipfile.BadZipFile, OSError):
-        return  # what is wrong with it is said when it is read
+        return  # it is refused when it is read
     require_memory(path, 2 * size, f"{size} bytes of arrays")
 
 
@@ -197,12 +197,12 @@ def _channels(
     used: list[str] = []
     for name, array in fitting.items():
         if array.ndim == axes:
-            own, said = [name], [""]
+            own, own_units = [name], [""]
             columns.append(array)
         else:
             width = array.shape[-1]
-            own, said = [f"{name}.{i}" for i in range(width)], [""] * width
-            for texts, usual in ((own, _NAMES), (said, _UNITS)):
+            own, own_units = [f"{name}.{i}" for i in range(width)], [""] * width
+            for texts, usual in ((own, _NAMES), (own_units, _UNITS)):
                 for key in usual:
                     array_of_texts = arrays.get(key)
                     if (
@@ -216,7 +216,7 @@ def _channels(
                         break
             columns += [array[..., i] for i in range(width)]
         names += own
-        units += said
+        units += own_units
     left = [name for name in arrays if name not in fitting and name not in used]
     return names, units, columns, left
 

@@ -20,7 +20,7 @@ from offbeat.errors import FileFormatError
 _ROWS = 1 << 16  # in memory at a time, beside the result
 _BUFFER = 1 << 18  # bytes of a column as it is stored, in memory at a time
 _THREADS = 4  # columns that are read at once, at most
-_MANY = 1 << 20  # cells that are worth a thread
+_MANY = 1 << 20  # values that are worth a thread
 _INDEX = "__index_level_0__"  # what pandas calls an index without a name
 
 
@@ -49,7 +49,7 @@ def read_parquet(
             by its name, see `LABEL_NAMES`.
         channels: the columns to read as channels, in the order wanted; by default all.
         time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's type or name says,
-            else found by the numbers, which is said aloud, else `s`.
+            else found by the numbers, which is noted, else `s`.
         units: unit of a channel by its name.
         channel_column: the column that says which channel a value is of, in the long form.
         value_column: the column of values, in the long form.
@@ -109,14 +109,14 @@ def read_parquet(
             table = gather_columns(sources, columns, rows, widths=widths)
     except NullCellError as error:
         raise FileFormatError(
-            f"{path} has an empty cell in row {error.row}, column {error.column!r}, where every "
+            f"{path} has an empty value in row {error.row}, column {error.column!r}, where every "
             "row needs a value; drop that row"
         ) from None
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        said = line_error(path, error)
+        message = line_error(path, error)
         raise FileFormatError(
             f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
-            f"({str(said).removeprefix(f'{path}: ')}); copy it again"
+            f"({str(message).removeprefix(f'{path}: ')}); copy it again"
         ) from None
     return recordings(path, _spread(columns, widths), unit, notes, table)
 

@@ -95,7 +95,7 @@ def read_euroc(path: str | Path, *, sensors: Sequence[str] | None = None) -> lis
     A file is CSV whose header begins with `#timestamp`, in nanoseconds, and says units in brackets.
     A folder holds one sensor per folder, each with its `data.csv`, here or in `mav0`; the sensors
     are merged on the union of their stamps. Those whose data are not numbers (the pictures of a
-    camera) are left out, which is said aloud.
+    camera) are left out, which is noted.
 
     Source: Burri et al., The EuRoC micro aerial vehicle datasets, IJRR 35(10), 2016.
 
@@ -168,17 +168,17 @@ def _numbers(line: str) -> int:
 
 
 def _explain(path: Path) -> None:
-    """Raises an error that names the line at fault, if there is one."""
+    """Raises an error that names the wrong line, if there is one."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):
-                said = line.strip()
-                if said and not said.startswith("#") and _numbers(said) != len(TUM_COLUMNS):
+                text = line.strip()
+                if text and not text.startswith("#") and _numbers(text) != len(TUM_COLUMNS):
                     raise FileFormatError(
-                        f"{path} has {said[:60]!r} in line {number}, expected eight numbers: "
+                        f"{path} has {text[:60]!r} in line {number}, expected eight numbers: "
                         f"{' '.join(TUM_COLUMNS)}"
                     )
-                if said.casefold().startswith("nan"):
+                if text.casefold().startswith("nan"):
                     raise FileFormatError(f"{path} has no time in line {number}; drop that row")
     except UnicodeDecodeError as error:
         raise FileFormatError(

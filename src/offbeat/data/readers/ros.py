@@ -22,7 +22,7 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 _MAGIC = (b"#ROSBAG V", b"SQLite format 3\0", b"\x89MCAP0\r\n")
 _WAITING_BYTES = 16 * 2**20  # messages that wait to be decoded
 
-# Without being asked for, nobody wants a camera's picture, a map or a log text as channels.
+# Pictures, maps and texts are no channels unless they are asked for.
 _NOT_BY_DEFAULT = (
     "bond/",
     "diagnostic_msgs/",
@@ -203,14 +203,14 @@ def _topic_readers(
 
 
 def _read(bag: Bag, chosen: list[Connection], readers: dict[str, Topic], path: Path) -> None:
-    """Hands every message of the chosen topics to its reader, a heap at a time."""
-    heaps = {c.id: readers[c.topic] for c in chosen if c.topic in readers}
+    """Hands every message of the chosen topics to its reader, a batch at a time."""
+    batches = {c.id: readers[c.topic] for c in chosen if c.topic in readers}
     waiting = 0
     try:
-        for number, received, message in bag.messages(set(heaps)):
-            heap = heaps[number]
-            heap.times.append(received)
-            heap.messages.append(message)
+        for number, received, message in bag.messages(set(batches)):
+            batch = batches[number]
+            batch.times.append(received)
+            batch.messages.append(message)
             waiting += len(message) + 100
             if waiting > _WAITING_BYTES:
                 waiting = 0

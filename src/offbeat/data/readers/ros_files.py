@@ -48,7 +48,7 @@ class Connection:
             return dict(get_types_from_msg(self.definition, self.kind))
         parsed: dict[str, Any] = {}
         if self.form == "idl":
-            rule = "=" * 80 + "\n"  # stands above the name of each file in it
+            rule = "=" * 80 + "\n"  # the line above the name of each file in it
             if not self.definition.startswith(f"{rule}IDL: "):
                 return dict(get_types_from_idl(self.definition))
             for part in self.definition.split(rule)[1:]:
@@ -140,7 +140,7 @@ def _open_ros2(path: Path) -> Iterator[Bag]:
 
 
 def _check_length(path: Path) -> None:
-    """Raises for an SQLite file that lost its end; SQLite says so only where it looks for it."""
+    """Raises for a truncated SQLite file, which SQLite notices only when it reads the end."""
     with path.open("rb") as file:
         start = file.read(100)  # the header: sqlite.org/fileformat.html, section 1.3
     if len(start) < 100 or not start.startswith(b"SQLite format 3"):
@@ -166,10 +166,10 @@ def explained(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         what = " ".join(str(error).split()) or type(error).__name__
-        mend = "rosbag reindex" if path.suffix.lower() == ".bag" else "ros2 bag reindex"
+        repair = "rosbag reindex" if path.suffix.lower() == ".bag" else "ros2 bag reindex"
         raise FileFormatError(
             f"{path} can't be read as a ROS bag, it is truncated, damaged or of another format "
-            f"({what}); copy it again, or mend it with: {mend}"
+            f"({what}); copy it again, or repair it with: {repair}"
         ) from None
 
 
@@ -226,15 +226,15 @@ class _Bag1:
 
     def _connect(self, header: Mapping[bytes, bytes], data: bytes) -> None:
         (number,) = _U4(header[b"conn"])
-        said = _fields(data)
-        package, _, name = said[b"type"].decode().rpartition("/")
+        described = _fields(data)
+        package, _, name = described[b"type"].decode().rpartition("/")
         self.connections[number] = Connection(
             number,
             header[b"topic"].decode(),
             f"{package.removesuffix('/msg')}/msg/{name}",
             "ros1",
             "msg",
-            said[b"message_definition"].decode(errors="replace"),
+            described[b"message_definition"].decode(errors="replace"),
         )
 
     def messages(self, ids: set[int]) -> Iterator[tuple[int, int, bytes]]:
@@ -243,7 +243,7 @@ class _Bag1:
             self.file.seek(position)
             header, data = self._record()
             if header[b"op"][0] != _CHUNK:
-                raise ValueError(f"no chunk stands at {position}")
+                raise ValueError(f"there is no chunk at {position}")
             chunk = _decompressed(header[b"compression"].decode(), data)
             if len(chunk) != _U4(header[b"size"])[0]:
                 raise ValueError(f"the chunk at {position} is not complete")
@@ -277,7 +277,7 @@ def _of_chunk(chunk: bytes, ids: set[int]) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _without(header: bytes, at: int, when: int) -> bytes:
-    """A header without its number and time, which stand in either order."""
+    """A header without its number and time, which come in either order."""
     if at < when:
         return header[:at] + header[at + 4 : when] + header[when + 8 :]
     return header[:when] + header[when + 8 : at] + header[at + 4 :]

@@ -1,4 +1,4 @@
-"""Where the numbers stand in a serialised ROS message, and how thousands are decoded at once.
+"""The places of the numbers in a serialised ROS message, and decoding thousands of them at once.
 
 Messages of one topic mostly have one layout: the same length, the same lengths of strings and
 sequences. So a layout is found once, by walking along one message, and all messages that agree with
@@ -90,7 +90,7 @@ class Column:
 
 @dataclass
 class Row:
-    """What one message says at one time: a row of one signal.
+    """The values of one message at one time: a row of one signal.
 
     Args:
         suffix: what the signal's name has beside the topic's: the child frame of a transform.
@@ -105,11 +105,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything stands in messages of one length that agree in some of their bytes.
+    """The places of all fields in messages of one length that agree in some of their bytes.
 
     Args:
         places: (bytes,) the places of these bytes.
-        expected: (bytes,) what stands there.
+        expected: (bytes,) the bytes there.
         order: byte order, `<` or `>`.
         rows: what is taken from a message; several rows from a list of transforms.
         skipped: fields that are left out, each with the reason.
@@ -141,7 +141,7 @@ class Layout:
         """(messages, channels) the numbers, as float64."""
         values = np.empty((len(table), len(row.columns)))
         first = 0
-        while first < len(row.columns):  # numbers that stand side by side are taken together
+        while first < len(row.columns):  # adjacent numbers are taken together
             start = row.columns[first]
             size = int(start.code[-1])
             last = first + 1
@@ -169,7 +169,7 @@ def find_layout(
     cdr: bool,
     wanted: Callable[[str], bool] | None = None,
 ) -> Layout:
-    """Walks along one message and notes where everything stands.
+    """Goes through one message and notes the place of each field.
 
     Args:
         message: the message as it was serialised.
@@ -339,7 +339,7 @@ class _Walk:
             self.skipped.setdefault(here, "a time")
 
     def _run(self, base: str, count: int) -> tuple[int, str]:
-        """Place and type of numbers that stand side by side."""
+        """Place and type of adjacent numbers."""
         code = _CODES[base]
         size = int(code[-1])
         if self.cdr:

@@ -18,7 +18,7 @@ _LAYOUTS = 64  # remembered per topic and length of message
 
 @dataclass
 class _Part:
-    """Rows of one signal from one layout, out of one heap of messages."""
+    """Rows of one signal from one layout, out of one batch of messages."""
 
     order: NDArray[np.intp]
     header: NDArray[np.int64] | None
@@ -173,7 +173,7 @@ class Topic:
 
 
 def _in_order(parts: list[_Part]) -> list[_Part]:
-    """The rows of a heap of messages as they were logged, whatever layouts took turns."""
+    """The rows of a batch of messages in the order of the log, of all layouts together."""
     if len(parts) == 1:
         return parts
     order = np.concatenate([part.order for part in parts])

@@ -16,13 +16,13 @@ _STAMP = re.compile(
 _YEARS = range(1678, 2262)  # of which an int64 of nanoseconds since 1970 holds all of
 
 
-def form_of(cell: str) -> str | None:
-    """Whether a time stands `with` or `without` its offset from UTC; None if the text is no time.
+def form_of(field: str) -> str | None:
+    """Whether a time is `with` or `without` an offset from UTC; None if the text is no time.
 
     A time is a date, and most often a T or a space and the time of day, down to nine digits after
     the second's point; what is small may be left out. The offset is Z, +02, +0200 or +02:00.
     """
-    match = _STAMP.fullmatch(cell)
+    match = _STAMP.fullmatch(field)
     if match is None:
         return None
     day, clock, offset = match.groups()

@@ -20,15 +20,15 @@ from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, InputError, one_of
 
 MISSING = ("", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
-"""What a cell holds where its value is not known."""
+"""Fields whose value is not known."""
 
 DELIMITERS = (",", ";", "\t")
 """Tried in this order on the header, where none is given."""
 
-_BLANK = tuple(" " * n for n in range(1, 33))  # a cell that is padded, and nothing else
+_BLANK = tuple(" " * n for n in range(1, 33))  # a field that is padded, and nothing else
 _BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
 _COMMA = re.compile(r"[+-]?\d+,\d+")
-_SAMPLE = 1000  # lines that say what a column holds
+_SAMPLE = 1000  # lines that decide the type of a column
 _BLOCK = 1 << 20  # bytes of text in memory at a time
 
 
@@ -62,22 +62,22 @@ def read_csv(
         channels: the columns to read as channels (in the long form: their names in the column of
             channels), in the order wanted; by default all.
         time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's name says, else
-            found by the numbers, which is said aloud, else `s`. Times of ISO 8601 know theirs.
+            found by the numbers, which is noted, else `s`. Times of ISO 8601 need none.
         units: unit of a channel by its name.
-        delimiter: the character between two cells; by default a comma, or the semicolon or tab
+        delimiter: the character between two fields; by default a comma, or the semicolon or tab
             that the header has instead.
         channel_column: the column that says which channel a value is of, in the long form; by
             default found where the table has a `channel` and a `value` and nothing else.
         value_column: the column of values, in the long form.
-        decimal: what stands before the fraction of a number, `.` or `,`.
+        decimal: the decimal separator of numbers, `.` or `,`.
 
     Returns:
-        A recording per trajectory, in the order of their first rows; a cell that is empty, or
+        A recording per trajectory, in the order of their first rows; a field that is empty, or
         another of `MISSING`, is NaN.
 
     Raises:
         FileFormatError: the file is missing or empty, its header or a row is not as it must be, or
-            a cell is not a number.
+            a field is not a number.
         InputError: an option names a column or a unit that there is not.
     """
     if delimiter is not None and (
@@ -105,7 +105,7 @@ def read_csv(
     unit = "ns"
     notes: tuple[str, ...] = ()
     if form_of(_first_time(sample, columns)) is None:
-        found = [file.number(cell) for cell in sample[columns.time]]
+        found = [file.number(field) for field in sample[columns.time]]
         numbers = [number for number in found if number is not None]
         unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
     if not header[0]:
@@ -113,7 +113,7 @@ def read_csv(
     if not header[-1]:
         notes = (
             *notes,
-            "the last column has no name and no cell in the first lines; it is left out",
+            "the last column has no name and no field in the first lines; it is left out",
         )
     table, counted_in = file.columns(header, sample, columns, unit)
     return recordings(file.path, columns, counted_in, notes, table, shown=unit)
@@ -129,21 +129,21 @@ class _CsvFile:
 
     def with_delimiter_of_header(self) -> _CsvFile:
         """The same file, with the delimiter that its header has."""
-        _, cells = next(self._lines(), (0, [""]))
-        if len(cells) == 1:
+        _, fields = next(self._lines(), (0, [""]))
+        if len(fields) == 1:
             for delimiter in DELIMITERS[1:]:
-                if delimiter in cells[0]:
+                if delimiter in fields[0]:
                     return replace(self, delimiter=delimiter)
         return self
 
     def header(self) -> list[str]:
         """The column names, stripped; unique; empty where one counts rows or ends all lines."""
-        line, cells = next(self._lines(), (0, []))
-        names = [cell.strip() for cell in cells]
+        line, fields = next(self._lines(), (0, []))
+        names = [field.strip() for field in fields]
         if line != 1:
             got = f"a header that ends in line {line}" if line else "empty lines alone"
             raise FileFormatError(
-                f"{self.path} must name its columns in line 1, got {got}; mend its first line"
+                f"{self.path} must name its columns in line 1, got {got}; correct its first line"
             )
         names[0] = names[0].removeprefix("#").strip()
         if names[0] == "Unnamed: 0":
@@ -153,28 +153,28 @@ class _CsvFile:
                 i == len(names) - 1 and self._is_empty(i)
             )
             if (name in names[:i] and name) or not (name or unnamed):
-                fault = f"the column name {name!r} twice" if name else f"no name for column {i}"
+                problem = f"the column name {name!r} twice" if name else f"no name for column {i}"
                 raise FileFormatError(
-                    f"{self.path} has {fault} in its first line, got {listed(names)}; "
+                    f"{self.path} has {problem} in its first line, got {listed(names)}; "
                     "give every column a name of its own"
                 )
         return names
 
     def _counts_rows(self) -> bool:
-        cells = [line[0] for _, line in itertools.islice(self._lines(), 1, _SAMPLE)]
-        first = int(cells[0]) if cells and cells[0].isdecimal() else 0
-        return cells == [str(first + i) for i in range(len(cells))]
+        fields = [line[0] for _, line in itertools.islice(self._lines(), 1, _SAMPLE)]
+        first = int(fields[0]) if fields and fields[0].isdecimal() else 0
+        return fields == [str(first + i) for i in range(len(fields))]
 
     def _is_empty(self, place: int) -> bool:
         """Whether a column holds nothing, in the first lines."""
         lines = itertools.islice(self._lines(), 1, _SAMPLE)
-        return not any(cell.strip() for _, cells in lines for cell in cells[place:])
+        return not any(field.strip() for _, fields in lines for field in fields[place:])
 
     def sample(self, header: list[str]) -> dict[str, list[str]]:
-        """The cells of the first lines, by column."""
-        lines = [cells for _, cells in itertools.islice(self._lines(), 1, _SAMPLE)]
-        whole = [cells for cells in lines if len(cells) == len(header)]
-        return {name: [cells[i].strip() for cells in whole] for i, name in enumerate(header)}
+        """The fields of the first lines, by column."""
+        lines = [fields for _, fields in itertools.islice(self._lines(), 1, _SAMPLE)]
+        whole = [fields for fields in lines if len(fields) == len(header)]
+        return {name: [fields[i].strip() for fields in whole] for i, name in enumerate(header)}
 
     def columns(
         self, header: list[str], sample: dict[str, list[str]], columns: Columns, unit: str
@@ -187,7 +187,7 @@ class _CsvFile:
         places = len(str(NANOSECONDS_PER[unit])) - 1
         clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
         if not all(
-            cell.isascii() and cell.lstrip("+-").isdecimal() for cell in sample[columns.time]
+            field.isascii() and field.lstrip("+-").isdecimal() for field in sample[columns.time]
         ):
             clocks = clocks[1:]
         form = form_of(_first_time(sample, columns))
@@ -258,62 +258,62 @@ class _CsvFile:
             )
         what = "trajectory" if error.column == columns.label else "channel"
         return FileFormatError(
-            f"{self.path} has an empty cell in line {line}, column {error.column!r}; every row "
+            f"{self.path} has an empty field in line {line}, column {error.column!r}; every row "
             f"must say which {what} it belongs to"
         )
 
     def _explain(self, header: list[str], columns: Columns, sample: dict[str, list[str]]) -> None:
-        """Raises an error that names the line and column at fault, if one can be found."""
+        """Raises an error that names the wrong line and column, if it finds them."""
         first = _first_time(sample, columns)
         form = form_of(first)
         truths = [name for name in columns.channels if _holds_booleans(sample[name])]
-        for line, cells in self._lines():
-            if len(cells) != len(header):
+        for line, fields in self._lines():
+            if len(fields) != len(header):
                 raise FileFormatError(
-                    f"{self.path} has {len(cells)} cells in line {line}, expected {len(header)}, "
+                    f"{self.path} has {len(fields)} fields in line {line}, expected {len(header)}, "
                     f"one per column: {listed(header)}"
                 )
-            for name, cell in zip(header, cells, strict=True):
-                if line == 1 or name not in columns.read or cell in MISSING or not cell.strip():
+            for name, field in zip(header, fields, strict=True):
+                if line == 1 or name not in columns.read or field in MISSING or not field.strip():
                     continue
-                number = self.number(cell)
-                comma = number is None and self.decimal == "." and _COMMA.fullmatch(cell.strip())
+                number = self.number(field)
+                comma = number is None and self.decimal == "." and _COMMA.fullmatch(field.strip())
                 if name in (columns.time, *columns.channels) and comma:
                     expected = "a number; if its comma is a decimal point, say so with decimal=','"
                 elif name == columns.time:
-                    fits = number is not None if form is None else form_of(cell.strip()) == form
+                    fits = number is not None if form is None else form_of(field.strip()) == form
                     expected = "" if fits else expected_after(first)
                 elif name in truths:
-                    expected = "" if cell in _BOOLEANS else f"one of {', '.join(_BOOLEANS)}"
+                    expected = "" if field in _BOOLEANS else f"one of {', '.join(_BOOLEANS)}"
                 elif name in columns.channels and number is None:
                     expected = "a number; choose the columns that are channels with channels="
                 else:
                     continue
                 if expected:
                     raise FileFormatError(
-                        f"{self.path} has {cell!r} in line {line}, column {name!r}, expected "
+                        f"{self.path} has {field!r} in line {line}, column {name!r}, expected "
                         f"{expected}"
                     )
 
-    def number(self, cell: str) -> float | None:
-        """The number in a cell, or None."""
+    def number(self, field: str) -> float | None:
+        """The number in a field, or None."""
         if self.decimal != ".":
-            cell = cell.replace(".", "?").replace(self.decimal, ".")
+            field = field.replace(".", "?").replace(self.decimal, ".")
         try:
-            number = float(cell)
+            number = float(field)
         except ValueError:
             return None
-        # Python allows _ between digits, and digits of other scripts, and nobody else does.
-        return number if cell.isascii() and "_" not in cell else None
+        # Python allows _ between digits, and digits of other scripts; other programs do not.
+        return number if field.isascii() and "_" not in field else None
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Line numbers and cells, header included; empty lines are skipped, as pyarrow does."""
+        """Line numbers and fields, header included; empty lines are skipped, as pyarrow does."""
         try:
             with self.path.open(encoding="utf-8-sig", newline="") as file:
                 reader = csv.reader(file, delimiter=self.delimiter)
-                for cells in reader:
-                    if cells:
-                        yield reader.line_num, cells
+                for fields in reader:
+                    if fields:
+                        yield reader.line_num, fields
         except (UnicodeDecodeError, csv.Error) as error:
             raise FileFormatError(
                 f"{self.path} can't be read as CSV ({error}); it must be text in UTF-8"
@@ -321,17 +321,17 @@ class _CsvFile:
 
 
 def _first_time(sample: dict[str, list[str]], columns: Columns) -> str:
-    """The first cell of the clock that says something, or nothing."""
-    return next((cell for cell in sample[columns.time] if cell not in MISSING), "")
+    """The first field of the clock that is not empty, or an empty one."""
+    return next((field for field in sample[columns.time] if field not in MISSING), "")
 
 
-def _type_of(cells: list[str]) -> Any:
-    """The Arrow type of a channel by its first cells: booleans by name, else numbers."""
+def _type_of(fields: list[str]) -> Any:
+    """The Arrow type of a channel by its first fields: booleans by name, else numbers."""
     import pyarrow as pa
 
-    return pa.bool_() if _holds_booleans(cells) else pa.float64()
+    return pa.bool_() if _holds_booleans(fields) else pa.float64()
 
 
-def _holds_booleans(cells: list[str]) -> bool:
-    known = [cell for cell in cells if cell not in MISSING]
-    return bool(known) and all(cell in _BOOLEANS for cell in known)
+def _holds_booleans(fields: list[str]) -> bool:
+    known = [field for field in fields if field not in MISSING]
+    return bool(known) and all(field in _BOOLEANS for field in known)

@@ -1,7 +1,7 @@
 """PX4 flight logs (ULog), through `pyulog`: every topic with its own stamps.
 
 The format: docs.px4.io, "ULog File Format". A log that was cut off, as by a loss of power, is read
-up to there, and the cut is said aloud; so are dropouts, which the autopilot logs itself.
+up to there, and the cut is noted; so are dropouts, which the autopilot logs itself.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ class _Watched(io.BufferedReader):
 
 
 def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
-    """The log, and what is to be said about it."""
+    """The log, and notes on it."""
     from pyulog import ULog
 
     printed = io.StringIO()
@@ -193,13 +193,13 @@ def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
         )
     notes = []
     if log.file_corruption:
-        said = printed.getvalue().splitlines()
-        why = f" ({said[0]})" if said else ""
+        lines = printed.getvalue().splitlines()
+        why = f" ({lines[0]})" if lines else ""
         notes.append(f"the file is damaged{why}; what could be made out is read")
     elif file.cut:
         seconds = (log.last_timestamp - log.start_timestamp) / 1e6
         notes.append(
-            f"the file is cut off in the middle of a message, as by a loss of power; what stands "
+            f"the file is cut off in the middle of a message, as by a loss of power; what comes "
             f"before is read, {seconds:.3f} s"
         )
     if log.dropouts:

@@ -54,7 +54,7 @@ def write_dataset(dataset: Dataset, path: str | Path) -> None:
     """Writes a data set as a table: a row per time, columns `trajectory`, `time`, and channels.
 
     `trajectory` is the label of the trajectory where it has one, else its number. A channel's unit
-    stands in brackets after its name.
+    follows its name in brackets.
 
     Args:
         dataset: the data set.
@@ -108,4 +108,4 @@ def _csv_column(array: NDArray[Any]) -> Any:
     if ((array == np.trunc(array)) | np.isnan(array)).all():
         # pyarrow writes 1.0 as 1, and a column of those would read as an integer clock.
         return pa.array([None if x != x else repr(x) for x in array.tolist()], pa.string())
-    return pa.array(array, from_pandas=True)  # a NaN becomes a null, which is an empty cell
+    return pa.array(array, from_pandas=True)  # a NaN becomes a null, which is an empty field
