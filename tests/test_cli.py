@@ -477,10 +477,8 @@ def test_a_missing_extra_is_named_by_its_extra(tmp_path):
     assert not list(Path(tmp_path).iterdir())
 
 
-def test_the_example_config_is_the_training_of_the_zoo_and_runs(data, tmp_path):
+def test_the_example_config_runs(data, tmp_path):
     path = Path(__file__).parents[1] / "examples" / "anchored.yaml"
-    training = yaml.safe_load(path.read_text())["training"]
-    assert ob.train_config("anchored_ode_gru_d", epochs=15) == ob.TrainConfig(**training)
     arguments = ["--split.window=20", "--training.epochs=1", "--model.hidden_size=4"]
     out = tmp_path / "run"
     assert main(["train", f"--config={path}", *arguments, str(data), str(out)]) == 0

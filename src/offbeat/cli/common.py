@@ -60,11 +60,12 @@ def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str,
     if "format" in given or run is None or not (run / READER_FILE).is_file():
         return given
     try:
-        return {**json.loads((run / READER_FILE).read_text(encoding="utf-8")), **given}
+        kept = dict(json.loads((run / READER_FILE).read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
         raise FileFormatError(
             f"{run / READER_FILE} is damaged ({error}); give --reader.format and other options"
         ) from None
+    return {**kept, **given}
 
 
 def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) -> dict[str, Any]:
