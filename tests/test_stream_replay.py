@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from model_helpers import dataset, small_model, trajectory
+from model_helpers import dataset, trajectory
 from stream_helpers import message
 
 import offbeat as ob
@@ -19,24 +18,27 @@ from offbeat.data.batch import Batch
 class Mixer(torch.nn.Module):
     """Each row from the values, masks and times of all rows before it."""
 
-    def __init__(self, data: ob.Dataset) -> None:
+    def __init__(self, data: ob.DataInfo) -> None:
         super().__init__()
-        like = small_model("gru", data, dtype=torch.float64, scaler="standardise")
-        self.names, self.units, self.channels = like.names, like.units, like.channels
-        self.scaler, self.statistics, self.dtype = like.scaler, like.statistics, like.dtype
         generator = torch.Generator().manual_seed(0)
-        weight = torch.randn(self.channels, 2 * self.channels, generator=generator)
+        weight = torch.randn(data.channels, 2 * data.channels, generator=generator)
         self.weight = torch.nn.Parameter(weight.double())
 
-    def forward(self, batch: Batch) -> Any:
+    def forward(self, batch: Batch) -> ob.Prediction:
         seen = torch.cat([torch.where(batch.mask, batch.values, 0.0), batch.mask.double()], dim=2)
         age = batch.times[:, :, None] - batch.times[:, None, :]
-        before = torch.tril(torch.ones_like(age), -1)
-        return SimpleNamespace(mean=torch.einsum("bij,bjk,ck->bic", before * torch.exp(-age), seen,
-                                                 self.weight))  # fmt: skip
+        weight = torch.tril(torch.ones_like(age), -1) * torch.exp(-age)
+        return ob.Prediction(torch.einsum("bij,bjk,ck->bic", weight, seen, self.weight))
 
 
-def batch_predictions(model: Mixer, one: ob.Trajectory) -> Any:
+@pytest.fixture(scope="module")
+def model() -> Any:
+    """The module, registered and made for some data."""
+    ob.register_model("mixer", Mixer, replace=True)
+    return ob.make_model("mixer", dataset(4))
+
+
+def batch_predictions(model: Any, one: ob.Trajectory) -> Any:
     with torch.no_grad():
         mean = model(Batch.of([one], scaler=model.scaler, dtype=model.dtype)).mean[0]
     return model.scaler.original(mean.numpy())
@@ -50,14 +52,14 @@ def streamed(stream: ob.Stream, one: ob.Trajectory, rows: range) -> Any:
     return np.array(got)
 
 
-def test_a_stream_of_any_module_predicts_what_its_batch_predicts() -> None:
-    model, one = Mixer(dataset(4)), trajectory(4, 14)
+def test_a_stream_of_any_module_predicts_what_its_batch_predicts(model: Any) -> None:
+    one = trajectory(4, 14)
     got = streamed(ob.Stream(model), one, range(14))
     np.testing.assert_allclose(got, batch_predictions(model, one), rtol=0, atol=1e-12)
 
 
-def test_rows_older_than_the_window_do_not_count() -> None:
-    model, one = Mixer(dataset(4)), trajectory(4, 14)
+def test_rows_older_than_the_window_do_not_count(model: Any) -> None:
+    one = trajectory(4, 14)
     stream = ob.Stream(model, window_rows=5)
     streamed(stream, one, range(14))
     asked = one.times[-1] + 0.1
@@ -72,8 +74,8 @@ def test_rows_older_than_the_window_do_not_count() -> None:
     assert np.isfinite(ob.Stream(model, window_rows=1).predict(0.0)).all()
 
 
-def test_several_times_are_independent_and_the_newest_row_is_known_at_its_time() -> None:
-    model, one = Mixer(dataset(4)), trajectory(4, 8)
+def test_several_times_are_independent_and_the_newest_row_is_known_at_its_time(model: Any) -> None:
+    one = trajectory(4, 8)
     stream = ob.Stream(model)
     streamed(stream, one, range(8))
     asked = one.times[-1] + np.array([0.0, 0.3, 0.1])
@@ -81,8 +83,8 @@ def test_several_times_are_independent_and_the_newest_row_is_known_at_its_time()
     np.testing.assert_allclose(stream.predict(asked), each, rtol=0, atol=1e-12)
 
 
-def test_late_rows_and_records_are_as_for_any_stream() -> None:
-    model, one = Mixer(dataset(4)), trajectory(4, 12)
+def test_late_rows_and_records_are_as_for_any_stream(model: Any) -> None:
+    one = trajectory(4, 12)
     in_time, late = (ob.Stream(model, late="reorder", window_rows=6) for _ in range(2))
     streamed(in_time, one, range(8))
     for row in (0, 1, 2, 3, 4, 6, 5, 7):
@@ -96,3 +98,16 @@ def test_late_rows_and_records_are_as_for_any_stream() -> None:
         ob.Stream(model, late="reorder", window_rows=7).restore(late.state())
     again.reset()
     np.testing.assert_array_equal(again.predict(9.0), ob.Stream(model).predict(9.0))
+
+
+def test_answers_of_a_module_are_those_of_its_batch(model: Any) -> None:
+    data = dataset(3)
+    for one, got in zip(data, ob.predict(model, data), strict=True):
+        np.testing.assert_allclose(got.values, batch_predictions(model, one), rtol=0, atol=1e-12)
+    ahead, stream = ob.forecast(model, data, 0.1), ob.Stream(model)
+    streamed(stream, data[0], range(data[0].rows))
+    asked = ahead[0].times[0]
+    np.testing.assert_allclose(stream.predict(asked), ahead[0].values[0], rtol=0, atol=1e-12)
+    assert np.isfinite(ob.impute(model, data)[0].values).all()
+    with pytest.raises(ob.InputError):
+        ob.export_onnx(model, "model.onnx")

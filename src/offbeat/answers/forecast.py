@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from offbeat.answers.predict import increasing_seconds, predict
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.models.model import Model
+from offbeat.models.base import BaseModel
 
 
-def forecast(model: Model, dataset: Dataset, horizons: ArrayLike) -> Dataset:
+def forecast(model: BaseModel, dataset: Dataset, horizons: ArrayLike) -> Dataset:
     """Predicts what comes after the last row of each trajectory.
 
     Args:

@@ -19,9 +19,9 @@ from offbeat.answers.two_sided import (
 )
 from offbeat.config import TrainConfig
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.data.transforms import transforms_of
 from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.files import write_json
+from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_model, save_model
 from offbeat.models.model import Model
 from offbeat.models.zoo import make_model
@@ -35,7 +35,7 @@ RULE_FILE = "two_sided.json"
 
 
 def impute(
-    model: Model | TwoSided,
+    model: BaseModel | TwoSided,
     dataset: Dataset,
     *,
     mode: Literal["causal", "two_sided"] | None = None,
@@ -63,7 +63,7 @@ def impute(
     forward = model.forward if isinstance(model, TwoSided) else model
     mode = mode or ("two_sided" if isinstance(model, TwoSided) else "causal")
     one_of("mode", mode, MODES)
-    transforms = transforms_of(forward)
+    transforms = forward.transforms
     dataset = in_model_order(forward, dataset)
     applied = transforms.apply(dataset)
     if mode == "causal":
@@ -80,7 +80,7 @@ def impute(
             Trajectory(t.times, values, names=forward.names, units=forward.units)
             for t, values in zip(applied, fills, strict=True)
         ),
-        {**dataset.meta, "filled_by": forward.config.name, "filled": mode},
+        {**dataset.meta, "filled_by": forward.name, "filled": mode},
     )
     undone = transforms.undo(filled, dataset)
     return replace(
@@ -98,7 +98,7 @@ def impute(
 
 
 def fit_two_sided(
-    model: Model,
+    model: BaseModel,
     train: Dataset,
     validation: Dataset,
     config: TrainConfig | None = None,
@@ -128,9 +128,14 @@ def fit_two_sided(
     """
     folder = Path(out) if out is not None else None
     # What is reversed must be continuous already: a wrap is found from the past alone.
-    train, validation = (transforms_of(model).apply(part) for part in (train, validation))
+    train, validation = (model.transforms.apply(part) for part in (train, validation))
     ahead = fit(model, train, validation, config, out=folder, progress=progress)
-    back = make_model(model.config, reversed_in_time(train), scaler=model.scaler, seed=seed)
+    kind, options = (
+        (model.config, {})
+        if isinstance(model, Model)
+        else (model.name, getattr(model, "options", {}))
+    )
+    back = make_model(kind, reversed_in_time(train), scaler=model.scaler, seed=seed, **options)
     back.to(model.dtype)
     backwards = fit(
         back,
@@ -184,7 +189,7 @@ def load_two_sided(path: str | Path) -> TwoSided:
         ) from None
 
 
-def load_run(path: str | Path) -> Model | TwoSided:
+def load_run(path: str | Path) -> BaseModel | TwoSided:
     """Reads the model of a folder, or the pair where the run is two-sided.
 
     Args:

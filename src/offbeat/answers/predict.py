@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from offbeat.config import check_seed
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError
+from offbeat.models.base import BaseModel
 from offbeat.models.model import Model
 
 Times = ArrayLike | Sequence[ArrayLike]
 
 
 def predict(
-    model: Model,
+    model: BaseModel,
     dataset: Dataset,
     *,
     times: Times | None = None,
@@ -30,7 +30,8 @@ def predict(
     """Predicts each trajectory at any times, each from what was observed strictly before it.
 
     The model's input transforms are applied to the data and undone on the predictions: an angle
-    that was given wrapped is predicted wrapped.
+    that was given wrapped is predicted wrapped. A model of your own gets each time asked for as a
+    row in which nothing is observed.
 
     Args:
         model: trained.
@@ -56,7 +57,7 @@ def predict(
     if times is not None:
         _check_any_time(model)
     asked = [t.times for t in dataset] if times is None else _times_of_each(times, len(dataset))
-    transforms = transforms_of(model)
+    transforms = model.transforms
     applied = transforms.apply(dataset)
     results: list[Trajectory] = []
     for first in range(0, len(dataset), size):
@@ -66,9 +67,9 @@ def predict(
         ]
         batch = model.batch(replace(part, trajectories=tuple(t for t, _ in merged)))
         # The same generator for each part, as if they were one batch.
-        generator = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
+        drawn = {"generator": torch.Generator().manual_seed(seed)} if model.needs_generator else {}
         with torch.inference_mode():
-            scaled = model(batch, generator=generator).mean.double().numpy()
+            scaled = model(batch, **drawn).mean.double().cpu().numpy()
         for (union, rows), trajectory, values in zip(merged, part, scaled, strict=True):
             results.append(
                 Trajectory(
@@ -76,13 +77,14 @@ def predict(
                     model.scaler.original(values[rows]),
                     names=model.names,
                     units=model.units,
+                    roles=model.roles,
                     origin=trajectory.origin,
                 )
             )
-    return transforms.undo(Dataset(tuple(results), {"predicted_by": model.config.name}), dataset)
+    return transforms.undo(Dataset(tuple(results), {"predicted_by": model.name}), dataset)
 
 
-def in_model_order(model: Model, dataset: Dataset) -> Dataset:
+def in_model_order(model: BaseModel, dataset: Dataset) -> Dataset:
     """The data set with its channels in the order of the model; as it is where they differ."""
     same = set(dataset.names) == set(model.names)
     return dataset.select(model.names) if same and dataset.names != model.names else dataset
@@ -128,12 +130,14 @@ def _times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
     return [increasing_seconds(at, f"times of trajectory {i}") for i, at in enumerate(each)]
 
 
-def _check_any_time(model: Model) -> None:
+def _check_any_time(model: BaseModel) -> None:
     """A time asked for is a row in which nothing is observed; it must change no other prediction.
 
     Raises:
         InputError: it would.
     """
+    if not isinstance(model, Model):
+        return
     for field, value, meaning in (
         ("readout", "last_row", "predicts the next row, whenever it comes"),
         ("update_rows", "every", "is changed by every row, and a time asked for is one more row"),

@@ -16,9 +16,8 @@ from offbeat.answers.two_sided import TwoSided
 from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError
-from offbeat.models.model import Model
+from offbeat.models.base import BaseModel
 
 OVERALL = "all, scaled"
 """Name of the last line of a table: all channels, in units of their standard deviation."""
@@ -204,7 +203,7 @@ class ImputationScores:
 
 
 def fills_of(
-    model: Model | TwoSided, dataset: Dataset, *, seed: int = 0
+    model: BaseModel | TwoSided, dataset: Dataset, *, seed: int = 0
 ) -> dict[str, list[NDArray[np.float64]]]:
     """The fills of each predictor by name: the model, causal and two-sided, and trivial ones.
 
@@ -227,7 +226,7 @@ def fills_of(
 
 
 def score_imputation(
-    model: Model | TwoSided, dataset: Dataset, *, seed: int = 0
+    model: BaseModel | TwoSided, dataset: Dataset, *, seed: int = 0
 ) -> ImputationScores:
     """Scores fills of all masked values, beside last value, linear interpolation and PCHIP.
 
@@ -242,7 +241,7 @@ def score_imputation(
         InputError: nothing is masked, or other channels than the model's.
     """
     forward = model.forward if isinstance(model, TwoSided) else model
-    dataset = transforms_of(forward).apply(in_model_order(forward, dataset))
+    dataset = forward.transforms.apply(in_model_order(forward, dataset))
     if not any(masked_values(t).any() for t in dataset):
         raise InputError(
             "no value is known and masked, so no fill can be scored; mask some with mask_out "
@@ -268,7 +267,7 @@ def score_imputation(
 
 
 def score_forecast(
-    model: Model, dataset: Dataset, horizons: ArrayLike, *, targets: int = 20
+    model: BaseModel, dataset: Dataset, horizons: ArrayLike, *, targets: int = 20
 ) -> tuple[ChannelScores, ...]:
     """Scores forecasts at fixed horizons, beside the last value and constant velocity.
 
@@ -288,7 +287,7 @@ def score_forecast(
         InputError: horizons as of `forecast`, no row can be scored, other channels than the
             model's, or a model that cannot predict at any time.
     """
-    dataset = transforms_of(model).apply(in_model_order(model, dataset))
+    dataset = model.transforms.apply(in_model_order(model, dataset))
     if isinstance(targets, bool) or not isinstance(targets, int) or targets < 1:
         raise InputError(f"targets must be a number of rows of at least 1, got {targets!r}")
     mean = training_mean(model)
@@ -303,7 +302,7 @@ def score_forecast(
             asked = [np.array([at]) for _, at, _, _ in tasks]
             predicted = predict(model, pasts, times=asked)
             for (past, at, truth, counted), answer in zip(tasks, predicted, strict=True):
-                each = {model.config.name: answer.values}
+                each = {model.name: answer.values}
                 for method in FORECASTERS:
                     each[method] = forecast(past, np.array([at]), method, mean)
                 sums.add(truth, each, counted)
@@ -316,13 +315,13 @@ def score_forecast(
     return tuple(results)
 
 
-def training_mean(model: Model) -> list[float]:
+def training_mean(model: BaseModel) -> list[float]:
     """The mean of each channel over the observed values of the training set, in its unit."""
     mean: list[float] = model.scaler.original(np.array(model.statistics.mean)).tolist()
     return mean
 
 
-def _sums_for(model: Model) -> ErrorSums:
+def _sums_for(model: BaseModel) -> ErrorSums:
     scale = np.abs(model.scaler.scale) * np.array(model.statistics.std)
     return ErrorSums(model.names, model.units, scale)
 

@@ -41,9 +41,8 @@ from offbeat.answers.predict import in_model_order, predict
 from offbeat.baselines import fill
 from offbeat.data.masking import mask_out, masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.data.transforms import transforms_of
 from offbeat.errors import InputError
-from offbeat.models.model import Model
+from offbeat.models.base import BaseModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +58,8 @@ class TwoSided:
         InputError: the models have different channels.
     """
 
-    forward: Model
-    backward: Model
+    forward: BaseModel
+    backward: BaseModel
     rule: FillRule
 
     def __post_init__(self) -> None:
@@ -115,7 +114,9 @@ def fill_two_sided(pair: TwoSided, dataset: Dataset, *, seed: int = 0) -> list[_
     return filled
 
 
-def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int = 0) -> FillRule:
+def fit_rule(
+    forward: BaseModel, backward: BaseModel, validation: Dataset, *, seed: int = 0
+) -> FillRule:
     """Fits the weights of the rule, in closed form, to the masked values of validation data.
 
     Args:
@@ -125,7 +126,7 @@ def fit_rule(forward: Model, backward: Model, validation: Dataset, *, seed: int 
             random.
         seed: of that mask, and of the generator of self-feeding.
     """
-    validation = transforms_of(forward).apply(in_model_order(forward, validation))
+    validation = forward.transforms.apply(in_model_order(forward, validation))
     if not any(masked_values(t).any() for t in validation):
         validation = mask_out(validation, 0.7, mask="values", seed=seed)
     scale = np.abs(forward.scaler.scale) * np.array(forward.statistics.std)
@@ -164,7 +165,9 @@ class _Sides:
     terms: _Array
 
 
-def _sides(forward: Model, backward: Model, dataset: Dataset, seed: int) -> Iterator[_Sides]:
+def _sides(
+    forward: BaseModel, backward: BaseModel, dataset: Dataset, seed: int
+) -> Iterator[_Sides]:
     ahead = predict(forward, dataset, seed=seed)
     back = predict(backward, reversed_in_time(dataset), seed=seed)
     for trajectory, f, b in zip(dataset, ahead, back, strict=True):

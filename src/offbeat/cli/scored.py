@@ -18,13 +18,13 @@ from offbeat.answers.two_sided import TwoSided
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.evaluation import Evaluation
-from offbeat.models.model import Model
+from offbeat.models.base import BaseModel
 from offbeat.plots.answers import answers
 from offbeat.plots.figures import save
 
 
 def scored(
-    model: Model | TwoSided,
+    model: BaseModel | TwoSided,
     dataset: Dataset,
     evaluation: Evaluation,
     *,
@@ -67,7 +67,7 @@ def scored(
 
 
 def fill_figure(
-    model: Model | TwoSided,
+    model: BaseModel | TwoSided,
     dataset: Dataset,
     path: Path,
     channels: Sequence[str],
@@ -98,7 +98,7 @@ def fill_figure(
 
 
 def forecast_figure(
-    model: Model,
+    model: BaseModel,
     dataset: Dataset,
     horizons: NDArray[np.float64],
     path: Path,
@@ -129,6 +129,6 @@ def forecast_figure(
     save(answers(end, drawn, channels, title=truth.origin), path)
 
 
-def _filled(trajectory: Trajectory, method: str, model: Model) -> Trajectory:
+def _filled(trajectory: Trajectory, method: str, model: BaseModel) -> Trajectory:
     values = baselines.fill(trajectory, method, training_mean(model))
     return replace(trajectory, values=np.where(trajectory.observed, trajectory.values, values))

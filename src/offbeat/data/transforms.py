@@ -318,9 +318,3 @@ def unit_quaternions(four: Values) -> Values:
     length = lengths(four)
     keep = (np.abs(length - 1) <= _UNIT_LENGTH) | ~(length > NO_LENGTH)
     return four / np.where(keep, 1.0, length)[:, None]
-
-
-def transforms_of(model: object) -> Transforms:
-    """The transforms of a model; those of one that has none change nothing."""
-    found = getattr(model, "transforms", None)
-    return found if isinstance(found, Transforms) else Transforms.identity()

@@ -4,79 +4,166 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
-from offbeat.data.transforms import transforms_of
+from offbeat import kernels
+from offbeat.data.batch import Batch
 from offbeat.errors import InputError, one_of, require
 from offbeat.export.runner import FORMAT, METADATA, STATE, VERSION
-from offbeat.export.step import StreamStep, most_steps
 from offbeat.files import atomic_path
+from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model
 from offbeat.ode import tableau
 
 MOST_STEPS = 256
-"""Solver steps over one gap that are written out; more make a graph that nobody wants to load."""
+"""Solver steps over one gap that are written out; a graph of more would be too large to load."""
 
 
 def export_onnx(model: Model, path: str | Path) -> None:
     """Writes one streaming step of a model as an ONNX file, for `OnnxStream` or any ONNX runtime.
 
-    Inputs: `t` (1,) float64, s, on any clock that keeps its origin; `values` (1, channels) float64
-    in original units, NaN where not measured; and the state. Outputs: `prediction` (1, channels)
-    float64 in original units, of a row at `t`, before its values are looked at; and the state
-    after the row, each part named as the input with `_next`. A prediction alone is the same step
-    with all values NaN, its state thrown away. The state before anything was seen, channel names
-    and units stand as JSON in the metadata under `offbeat`.
+    Inputs: `t` (1,) float64, s, since any fixed origin; `values` (1, channels) float64 in original
+    units, transformed, NaN where not measured; and the state. Outputs: `prediction` (1, channels)
+    float64 in original units, of a row at `t`, before its values are used; and the state after the
+    row, each part named as the input with `_next`. A prediction alone is the same step with all
+    values NaN, whose state is not used. The initial state, channel names, units and input
+    transforms are JSON in the metadata under `offbeat`.
+
+    The graph is a trace of `model.forward` in the reference backend, for one row.
 
     Args:
         model: trained.
         path: .onnx file to write, whole or not at all.
 
     Raises:
-        InputError: an adaptive solver, whose number of steps no fixed graph can have; more than
-            256 steps over a gap; self-feeding, which draws generator; or another suffix.
+        InputError: a model without a recurrent state or with actions; an adaptive solver, whose
+            number of steps no fixed graph can have; more than 256 steps over a gap; self-feeding,
+            which draws random numbers; or another suffix.
         MissingExtraError: onnx or onnxscript is not installed.
     """
     path = Path(path)
     one_of("suffix of an ONNX file", path.suffix, (".onnx",))
     _check_exportable(model)
     onnx = require("onnx", "export")
-    require("onnxscript", "export")
-    step = StreamStep(model).eval()
-    carry = model.empty_state(1)
-    initial = {name: getattr(carry, name).detach().clone() for name in STATE}
+    optimizer: Any = require("onnxscript.optimizer", "export")
+    past = model.empty_state(1)
+    initial = {name: getattr(past, name).detach().cpu().clone() for name in STATE}
     inputs = (
         torch.zeros(1, dtype=torch.float64),
         torch.zeros((1, model.channels), dtype=torch.float64),
         *initial.values(),
     )
-    with torch.no_grad(), _quiet():
+    with torch.no_grad(), _quiet(), _traceable(model):
         program: Any = torch.onnx.export(
-            step,
+            StreamStep(model).eval(),
             inputs,
             input_names=["t", "values", *STATE],
             output_names=["prediction", *(f"{name}_next" for name in STATE)],
             dynamo=True,
+            optimize=False,
             verbose=False,
         )
+    # All but its rule for nested bounds, which can refer to a constant that it does not add.
+    optimizer.fold_constants(program.model)
+    optimizer.remove_unused_nodes(program.model)
     proto = program.model_proto
     entry = proto.metadata_props.add()
-    entry.key, entry.value = METADATA, json.dumps(_facts(model, initial), allow_nan=False)
+    entry.key, entry.value = METADATA, json.dumps(_record(model, initial), allow_nan=False)
     onnx.checker.check_model(proto)
     with atomic_path(path) as temporary:
         temporary.write_bytes(proto.SerializeToString())
 
 
+class StreamStep(nn.Module):
+    """One row of one trajectory: `model.forward`, from and to original units.
+
+    Args:
+        model: runs within `_traceable`.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, model: Model) -> None:
+        super().__init__()
+        self.model = model
+        self.register_buffer("shift", torch.tensor(model.scaler.shift)[None])
+        self.register_buffer("scale", torch.tensor(model.scaler.scale)[None])
+
+    def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """Prediction and next state.
+
+        Args:
+            t: (1,) float64, s.
+            values: (1, channels) float64, original units, NaN where not measured.
+            *state: the parts named in `STATE`, as in `RecurrentState`.
+        """
+        with _ExactNumbers():
+            scaled = ((values - self.shift) / self.scale).to(self.model.dtype)
+            mask = scaled.abs() < math.inf  # False for NaN, too
+            scaled = torch.where(mask, scaled, torch.zeros_like(scaled))[:, None]
+            mask, valid = mask[:, None], torch.ones_like(t[:, None], dtype=torch.bool)
+            row = Batch(t[:, None], scaled, mask, mask, valid, self.model.roles)
+            given: dict[str, Any] = dict(zip(STATE, state, strict=True))
+            past = RecurrentState(**given)
+            output = self.model(row, past=past)
+            prediction = output.mean[:, 0].double() * self.scale + self.shift
+            # An output that is an input itself would be left out of the graph.
+            return prediction, *(getattr(output.past, name).clone() for name in STATE)
+
+
+class _ExactNumbers(TorchFunctionMode):
+    """Makes tensors of Python numbers that float32 does not hold, as the exporter writes it."""
+
+    def __torch_function__(
+        self,
+        func: Callable[..., Any],
+        types: Any,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        """Calls `func` with tensors for such numbers."""
+        kwargs = kwargs or {}
+        if func is torch.add and "alpha" in kwargs:
+            return args[0] + _exact(kwargs["alpha"]) * args[1]
+        if any(isinstance(arg, Tensor) for arg in args):
+            args = tuple(_exact(arg) for arg in args)
+        return func(*args, **kwargs)
+
+
+def _exact(value: Any) -> Any:
+    if type(value) is float and math.isfinite(value) and float(np.float32(value)) != value:
+        return torch.tensor(value, dtype=torch.float64)
+    return value
+
+
+@contextmanager
+def _traceable(model: Model) -> Iterator[None]:
+    """Runs a model in the reference backend, with a fixed number of solver steps."""
+    spec = model.spec
+    try:
+        if spec.max_step is not None:
+            model.spec = replace(spec, most_steps=most_steps(model))
+        with kernels.use("reference"):
+            yield
+    finally:
+        model.spec = spec
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps to itself what the exporter says of its own insides."""
+    """Suppresses the warnings of the exporter about its own internals."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)
@@ -88,10 +175,19 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _facts(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
-    """What a stream must know that the graph does not say."""
+def most_steps(model: Model) -> int:
+    """Solver steps over the longest gap that a model's time can have."""
+    if model.spec.max_step is None:
+        return model.spec.steps_per_gap
+    longest = model.statistics.longest_elapsed * float(model.config.gap_limit or 1)
+    needed = math.ceil(longest / model.time_unit / model.spec.max_step - 1e-6)
+    return max(model.spec.steps_per_gap, needed)
+
+
+def _record(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
+    """What a stream needs to know that is not in the graph."""
     limit = float(model.config.gap_limit or 1)
-    finite = {  # JSON has no infinities: these begin as the runner knows
+    finite = {  # JSON has no infinities: the runner knows the other initial values
         name: initial[name].tolist() for name in ("state", "last")
     }
     return {
@@ -102,17 +198,24 @@ def _facts(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
         "units": list(model.units),
         "median_gap_s": model.statistics.median_gap,
         "elapsed_limit_s": model.statistics.longest_elapsed * limit,
-        "transforms": transforms_of(model).to_dict(),
+        "transforms": model.transforms.to_dict(),
         "dtype": str(model.dtype).removeprefix("torch."),
         "initial": finite,
     }
 
 
 def _check_exportable(model: Model) -> None:
+    if not isinstance(model, Model):
+        raise InputError(
+            f"the model {model.name!r} has no recurrent state, so no step to export; stream it "
+            "with offbeat.Stream"
+        )
+    if model.acts:
+        raise InputError("a model with actions cannot be exported; stream it with offbeat.Stream")
     if model.config.self_feeding:
         raise InputError(
-            "a model with self_feeding draws a coin at every row, which no graph can; train one "
-            "without self_feeding to export it"
+            "a model with self_feeding draws random numbers at every row, which no graph can; "
+            "train one without self_feeding to export it"
         )
     if not model.spec.field:
         return

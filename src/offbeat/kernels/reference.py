@@ -213,6 +213,7 @@ def _solve(
         gap,
         scheme,
         steps=steps,
+        most_steps=spec.most_steps,
         rtol=spec.rtol,
         atol=spec.atol,
         adjoint_parameters=parameters,
@@ -233,7 +234,7 @@ def _solve_split(
     With one step per gap and every row observed this is algorithm 3 of the thesis.
     """
     start, end, applied = decay.start, decay.end, decay.applied
-    most = steps if isinstance(steps, int) else int(steps.max())
+    most = steps if isinstance(steps, int) else spec.most_steps or int(steps.max())
     for k in range(1, most + 1):
         part = k / steps if isinstance(steps, int) else (k / steps.to(gap)).clamp_max(1.0)
         reached = start + part * (end - start)

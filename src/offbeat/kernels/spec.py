@@ -44,6 +44,8 @@ class ScanSpec:
         solver: name of a tableau.
         steps_per_gap: least number of equal steps of a fixed-step solver over one gap.
         max_step: longest such step, model time; None for no bound.
+        most_steps: a bound on the steps of `max_step`, where the scan is traced; the reference
+            backend takes so many, of which the last ones have length 0.
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver.
         adjoint: gradients of the vector field's solution by the adjoint method.
@@ -70,6 +72,7 @@ class ScanSpec:
     solver: str = "euler"
     steps_per_gap: int = 1
     max_step: float | None = None
+    most_steps: int | None = None
     rtol: float = 1e-4
     atol: float = 1e-6
     adjoint: bool = False

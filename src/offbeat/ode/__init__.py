@@ -29,6 +29,7 @@ def solve(
     tableau: Tableau,
     *,
     steps: int | Tensor = 1,
+    most_steps: int | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
     adjoint_parameters: Sequence[Tensor] | None = None,
@@ -43,6 +44,7 @@ def solve(
         duration: (batch, 1) gap of each row in model time; a row of duration 0 keeps its state.
         tableau: the method; an adaptive one steps within the tolerance, any other in equal steps.
         steps: equal steps of every row, or (batch, 1) integers; unused by adaptive methods.
+        most_steps: a bound on `steps` that is known without looking at it, as tracing needs.
         rtol: tolerance relative to the state; used by adaptive methods only.
         atol: tolerance in the units of the state; used by adaptive methods only.
         adjoint_parameters: if given, gradients come from the adjoint method (`solve_adjoint`), and
@@ -59,12 +61,12 @@ def solve(
     if adjoint_parameters is None:
         if tableau.adaptive:
             return solve_adaptive(field, y, duration, tableau, rtol=rtol, atol=atol)
-        return solve_fixed(field, y, duration, tableau, steps)
+        return solve_fixed(field, y, duration, tableau, steps, most_steps)
     check_problem(y, duration)
 
     def walk(field: Field, y: Tensor, duration: Tensor, *, reuse: bool = True) -> Steps:
         if tableau.adaptive:
             return adaptive_steps(field, y, duration, tableau, rtol=rtol, atol=atol, reuse=reuse)
-        return fixed_steps(field, y, duration, tableau, steps, reuse=reuse)
+        return fixed_steps(field, y, duration, tableau, steps, most_steps, reuse=reuse)
 
     return solve_adjoint(field, y, duration, walk, tableau.b, adjoint_parameters)

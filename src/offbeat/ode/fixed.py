@@ -22,7 +22,12 @@ Steps = Iterator[tuple[Tensor, Tensor]]
 
 
 def solve_fixed(
-    field: Field, y: Tensor, duration: Tensor, tableau: Tableau, steps: int | Tensor = 1
+    field: Field,
+    y: Tensor,
+    duration: Tensor,
+    tableau: Tableau,
+    steps: int | Tensor = 1,
+    most_steps: int | None = None,
 ) -> Tensor:
     """Integrates dy/ds = duration * field(s, y) from s = 0 to 1 in equal steps.
 
@@ -34,6 +39,7 @@ def solve_fixed(
         duration: (batch, 1) gap of each row in model time; a row of duration 0 keeps its state.
         tableau: the method; of an adaptive one the embedded result is left unused.
         steps: number of steps of every row, or (batch, 1) integers, one for each row.
+        most_steps: a bound on `steps` that is known without looking at it, as tracing needs.
 
     Returns:
         (batch, size) states at the end of the gaps.
@@ -42,11 +48,11 @@ def solve_fixed(
         InputError: shapes or types disagree, or there are fewer steps than one.
     """
     check_problem(y, duration)
-    steps = _shared(steps, duration)
+    steps = steps if most_steps else _shared(steps, duration)
     if tableau.stages == 1 and isinstance(steps, int) and steps == 1:
         # Nearly every step of training is this one, so it must cost no more than the field.
         return torch.addcmul(y, duration, field(torch.zeros_like(duration), y))
-    for state, _ in fixed_steps(field, y, duration, tableau, steps):
+    for state, _ in fixed_steps(field, y, duration, tableau, steps, most_steps):
         y = state
     return y
 
@@ -57,6 +63,7 @@ def fixed_steps(
     duration: Tensor,
     tableau: Tableau,
     steps: int | Tensor,
+    most_steps: int | None = None,
     *,
     reuse: bool = True,
 ) -> Steps:
@@ -68,10 +75,11 @@ def fixed_steps(
         duration: (batch, 1) gap of each row.
         tableau: the method.
         steps: number of steps, or (batch, 1) of them.
+        most_steps: see `solve_fixed`.
         reuse: start a step from the last slope of the step before, if the method allows it.
     """
     slopes: list[Tensor] = []
-    for s, h, moving in _grid(duration, steps):
+    for s, h, moving in _grid(duration, steps, most_steps):
         known = slopes[-1] if slopes and reuse and tableau.first_same_as_last else None
         stepped, slopes = runge_kutta_step(field, s, h, y, duration, tableau, known)
         y = stepped if moving is None else torch.where(moving, stepped, y)
@@ -141,9 +149,11 @@ def check_problem(y: Tensor, duration: Tensor) -> None:
         )
 
 
-def _grid(duration: Tensor, steps: int | Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+def _grid(
+    duration: Tensor, steps: int | Tensor, most_steps: int | None
+) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
     """Yields (batch, 1) start and length of each step, and which rows move (None: all)."""
-    steps = _shared(steps, duration)
+    steps = steps if most_steps else _shared(steps, duration)
     s = torch.zeros_like(duration)
     # Lengths are differences of the ends, so that s + h is the end to the last bit.
     if isinstance(steps, int):
@@ -153,7 +163,7 @@ def _grid(duration: Tensor, steps: int | Tensor) -> Iterator[tuple[Tensor, Tenso
             s = end
         return
     counts = steps.to(duration)
-    for i in range(int(steps.max())):
+    for i in range(most_steps or int(steps.max())):
         end = counts.clamp(max=i + 1) / counts
         yield s, end - s, end > s
         s = end

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from offbeat.kernels import backend, choose, cpu
+from offbeat.kernels import choose, cpu
 from offbeat.models.model import Model
 from offbeat.parts import Point
 from offbeat.parts.decay import TrainableDecay
@@ -39,7 +39,7 @@ class CpuEngine(Engine):
         with torch.no_grad():
             self._live = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")(
                 spec=cpu.compiled_spec(spec),
-                instruction_set=backend()[0],
+                instruction_set=choose(spec, model.dtype, model.device).variant,
                 weights=_flat(list(model.scan_parts().tensors())),
                 mean=model.mean.numpy(),
                 std=model.std.numpy(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,25 +12,8 @@ from numpy.typing import NDArray
 
 from offbeat.data.batch import Batch
 from offbeat.data.trajectory import Trajectory
+from offbeat.models.base import BaseModel
 from offbeat.stream.engine import Arrays, Engine
-
-
-class WindowModel(Protocol):
-    """What is needed of a model: `forward(batch) -> Prediction`, each row from those before it."""
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Of its parameters."""
-
-    @property
-    def channels(self) -> int:
-        """Number of channels."""
-
-    def __call__(self, batch: Batch) -> Any:
-        """A prediction, its `mean` (batch, rows, channels) scaled."""
-
-    def state_dict(self) -> Any:
-        """Its tensors, by name."""
 
 
 class ReplayEngine(Engine):
@@ -41,7 +24,7 @@ class ReplayEngine(Engine):
         window: rows that are kept, 1 or more; older ones no longer matter.
     """
 
-    def __init__(self, model: WindowModel, *, window: int) -> None:
+    def __init__(self, model: BaseModel, *, window: int) -> None:
         self._model, self._window = model, window
         self._slots: list[Arrays] = []
         self.reset()
@@ -83,7 +66,8 @@ class ReplayEngine(Engine):
         batch = Batch.of(
             [Trajectory(np.append(self._rows["time"], time), values) for time in asked],
             dtype=self._model.dtype,
-        )
+            roles=self._model.roles,
+        ).to(self._model.device)
         with torch.inference_mode():
             mean: torch.Tensor = self._model(batch).mean
         return np.asarray(mean[:, -1].double().cpu().numpy())
@@ -114,7 +98,7 @@ class ReplayEngine(Engine):
 
     def fingerprint(self) -> str:
         """Of the class and the tensors."""
-        record = [type(self._model).__qualname__, str(self._model.dtype), self._window]
+        record = [self._model.name, str(self._model.dtype), self._window]
         digest = hashlib.sha256(json.dumps(record).encode())
         for name, tensor in sorted(self._model.state_dict().items()):
             digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from offbeat.config import check_seed
-from offbeat.data.transforms import transforms_of
+from offbeat.models.base import BaseModel
 from offbeat.models.model import Model
 from offbeat.stream.cpu_engine import CpuEngine
 from offbeat.stream.engine import Engine
@@ -45,7 +45,7 @@ class Stream(LiveStream):
 
     def __init__(
         self,
-        model: Model,
+        model: BaseModel,
         options: StreamOptions | None = None,
         *,
         time_unit: str = "s",
@@ -53,20 +53,20 @@ class Stream(LiveStream):
         **fields: Any,
     ) -> None:
         chosen = with_options(options, fields)
-        limit = float(getattr(getattr(model, "config", None), "gap_limit", None) or 1)
+        limit = float(model.config.gap_limit or 1) if isinstance(model, Model) else 1.0
         info = StreamInfo(
             names=model.names,
             units=model.units,
             scaler=model.scaler,
             median_gap=model.statistics.median_gap,
             elapsed_limit=model.statistics.longest_elapsed * limit,
-            transforms=transforms_of(model),
+            transforms=model.transforms,
         )
         engine = engine_of(model, seed=check_seed(seed), window=chosen.window_rows)
         super().__init__(engine, info, options=chosen, time_unit=time_unit)
 
 
-def engine_of(model: Model, *, seed: int, window: int) -> Engine:
+def engine_of(model: BaseModel, *, seed: int, window: int) -> Engine:
     """The fastest engine that runs a model.
 
     Args:

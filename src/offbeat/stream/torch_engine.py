@@ -22,7 +22,7 @@ from offbeat.stream.engine import Arrays, Engine
 class _State:
     """A recurrent state, and the state of its generator, which is shared and moves on."""
 
-    carry: RecurrentState
+    past: RecurrentState
     generator: Tensor | None
 
 
@@ -54,7 +54,10 @@ class TorchEngine(Engine):
         feeding = bool(self._model.config.self_feeding)
         generator = torch.Generator().manual_seed(self._seed) if feeding else None
         with torch.inference_mode():
-            self._carry = self._model.empty_state(1, generator=generator)
+            self._past = self._model.empty_state(1, generator=generator)
+            if self._model.acts:  # so that all states have the same parts
+                nothing = torch.full_like(self._past.last, torch.nan)
+                self._past = replace(self._past, actions=nothing)
 
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
         """Consumes one row."""
@@ -69,7 +72,7 @@ class TorchEngine(Engine):
         )
         try:
             with torch.inference_mode():
-                self._carry = self._model(row, past=self._carry).past
+                self._past = self._model(row.to(self._model.device), past=self._past).past
         except Exception:
             self._take(before)
             raise
@@ -85,16 +88,15 @@ class TorchEngine(Engine):
             unseen,
             self._valid.expand(count, 1),
         )
-        carried = {
-            name: part.expand(count, *part.shape[1:])
-            for name, part in _tensors(self._carry).items()
+        expanded = {
+            name: part.expand(count, *part.shape[1:]) for name, part in _tensors(self._past).items()
         }
-        carry = replace(self._carry, **carried)  # type: ignore[arg-type]
-        if carry.generator is not None:  # it acts after the prediction
-            carry = replace(carry, generator=torch.Generator())
+        past = replace(self._past, **expanded)  # type: ignore[arg-type]
+        if past.generator is not None:  # it acts after the prediction
+            past = replace(past, generator=torch.Generator())
         with torch.inference_mode():
-            predicted: Tensor = self._model(asked, past=carry).mean
-            return predicted[:, 0].double().numpy()
+            predicted: Tensor = self._model(asked.to(self._model.device), past=past).mean
+            return predicted[:, 0].double().cpu().numpy()
 
     def save(self, slot: int) -> None:
         """Keeps a reference to the state."""
@@ -110,18 +112,21 @@ class TorchEngine(Engine):
     def export(self) -> Arrays:
         """The parts of the recurrent state by name, `rows`, and `generator` where there is one."""
         state = self._state()
-        arrays = {name: part.numpy().copy() for name, part in _tensors(state.carry).items()}
-        arrays["rows"] = np.array(state.carry.rows, dtype=np.int64)
+        arrays = {name: part.cpu().numpy().copy() for name, part in _tensors(state.past).items()}
+        arrays["rows"] = np.array(state.past.rows, dtype=np.int64)
         if state.generator is not None:
             arrays["generator"] = state.generator.numpy().copy()
         return arrays
 
     def restore(self, arrays: Arrays) -> None:
         """Takes the parts of a recurrent state."""
-        parts: dict[str, Any] = {name: torch.tensor(arrays[name]) for name in _tensors(self._carry)}
-        carry = replace(self._carry, rows=int(arrays["rows"]), **parts)
+        device = self._model.device
+        parts: dict[str, Any] = {
+            name: torch.tensor(arrays[name], device=device) for name in _tensors(self._past)
+        }
+        past = replace(self._past, rows=int(arrays["rows"]), **parts)
         generator = torch.tensor(arrays["generator"]) if "generator" in arrays else None
-        self._take(_State(carry, generator))
+        self._take(_State(past, generator))
 
     def fingerprint(self) -> str:
         """Of config, statistics, scaler, channels and weights."""
@@ -140,15 +145,15 @@ class TorchEngine(Engine):
         return digest.hexdigest()
 
     def _state(self) -> _State:
-        generator = self._carry.generator
-        return _State(self._carry, None if generator is None else generator.get_state())
+        generator = self._past.generator
+        return _State(self._past, None if generator is None else generator.get_state())
 
     def _take(self, state: _State) -> None:
-        self._carry = state.carry
-        if state.generator is not None and state.carry.generator is not None:
-            state.carry.generator.set_state(state.generator)
+        self._past = state.past
+        if state.generator is not None and state.past.generator is not None:
+            state.past.generator.set_state(state.generator)
 
 
-def _tensors(carry: RecurrentState) -> dict[str, Tensor]:
-    parts = {field.name: getattr(carry, field.name) for field in fields(carry)}
+def _tensors(past: RecurrentState) -> dict[str, Tensor]:
+    parts = {field.name: getattr(past, field.name) for field in fields(past)}
     return {name: part for name, part in parts.items() if isinstance(part, Tensor)}
