@@ -1,4 +1,4 @@
-"""The demo: from simulation to a compared result in minutes, with everything it shows on disk."""
+"""The demo: from simulation to a comparison of models in two minutes, all of it in files."""
 
 from __future__ import annotations
 
@@ -75,20 +75,20 @@ class Training:
         return self.steps < self.full_steps
 
     def note(self) -> str:
-        """For the end of a line of the table."""
+        """The note at the end of a line of the table."""
         took = f"{self.steps} of {self.full_steps} steps, {self.seconds:.0f} s"
         return f"under-trained: {took}" if self.under_trained else took
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found and wrote; as text, its report.
+    """What the demo found and wrote. `print` shows it.
 
     Attributes:
-        folder: where everything lies.
+        folder: of all files.
         evaluation: every model and the last-value predictor on the test part.
         trainings: by model.
-        written: files and folders, relative to `folder`, each with what it holds.
+        written: files and folders, relative to `folder`, each with its description.
         messages: what could not be done, and why.
         seconds: wall time of this call.
     """
@@ -152,14 +152,14 @@ def run_demo(
     workers: int | None = None,
     progress: bool = True,
 ) -> DemoResult:
-    """Simulates a hopper, hides rows, trains five models, scores them, and shows the result.
+    """Simulates a hopper, masks rows, trains five models, scores them and plots the results.
 
-    Training stops long before the models of the thesis are done; the result says so. A demo that
-    was stopped goes on where it was. Results do not depend on `workers`.
+    Training stops long before the models of the thesis converge; the result says so. A demo that
+    was stopped continues where it was. Results do not depend on `workers`.
 
     Args:
         out: folder to write to.
-        seed: of windows, hidden rows, split, weights and batches.
+        seed: of windows, masks, split, weights and batches.
         n_trajectories: to simulate; 70 % of them are trained on.
         epochs: of the models of the thesis.
         anchored_epochs: of the anchored model.
@@ -168,7 +168,7 @@ def run_demo(
         progress: show progress bars on standard error.
 
     Returns:
-        What was found and written; `print` it.
+        Scores and files; `print` shows them.
 
     Raises:
         InputError: an argument is out of bounds, or `out` holds a demo with other settings.
@@ -236,14 +236,14 @@ def run_demo(
 
 _WRITTEN = {
     "results.csv": "a line per predictor",
-    "results.json": "all scores, per channel and by age of the last observation",
+    "results.json": "all scores, per channel and by time since the last observation",
     "learning_curves.png": "validation error while training",
     "predictions.png": "four channels of one test trajectory, each model one step ahead",
     "hopper.gif": "the same trajectory, simulated and predicted one step ahead",
-    "hopper_extrapolation.gif": "the same, nothing observed any more from the middle on",
+    "hopper_extrapolation.gif": "the same, with no observation after the middle",
     "models": "a run per model: log.csv, checkpoints, the trained model",
     "data": "training, validation and test part",
-    "settings.json": "what this folder was made with",
+    "settings.json": "the settings of this folder",
 }
 
 
@@ -263,9 +263,6 @@ def _check_folder(out: Path, settings: Mapping[str, Any]) -> None:
         raise InputError(
             f"{out} holds a demo with another {', '.join(other)}; give the same, or another folder"
         )
-
-
-# --- what is left on disk -------------------------------------------------------------------------
 
 
 def _write_scores(out: Path, evaluation: Evaluation, trainings: Mapping[str, Training]) -> None:
@@ -317,7 +314,7 @@ def _draw_predictions(out: Path, models: Mapping[str, Model], shown: Trajectory)
 
 
 def _animate(out: Path, model: Model, shown: Trajectory) -> tuple[str, ...]:
-    """Two GIFs of one trajectory; or, where MuJoCo cannot render, a line that says why not."""
+    """Writes two GIFs of one trajectory; returns why not, where MuJoCo cannot render."""
     free = ROWS // 2
     unseen = shown.observed & (np.arange(shown.rows) < free)[:, None]
     label = style_of(model.config.name).label
@@ -325,7 +322,7 @@ def _animate(out: Path, model: Model, shown: Trajectory) -> tuple[str, ...]:
         "hopper.gif": (shown, f"{label}: each row predicted from the observed rows before it"),
         "hopper_extrapolation.gif": (
             replace(shown, observed=unseen),
-            f"{label}: nothing observed any more from "
+            f"{label}: nothing observed from "
             f"{1e3 * (shown.times[free] - shown.times[0]):.0f} ms on",
         ),
     }

@@ -82,7 +82,6 @@ def advise(
     words = [f"--reader.{name}={_text(value)}" for name, value in options.items()]
     split, for_split = _split(inspection)
     words += [f"--split.{name}={chosen}" for name, chosen in split.items()]
-    words.append("--model.name=anchored_ode_gru_d")
     return Advice(("offbeat", "train", data, out, *words), (*reasons, *for_split))
 
 
