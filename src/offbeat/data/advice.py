@@ -90,7 +90,8 @@ def _useful(inspection: Inspection) -> list[ChannelInspection]:
 
 
 def _split(inspection: Inspection) -> tuple[dict[str, Any], list[str]]:
-    useful = _useful(inspection) or list(inspection.channels)
+    useful = [channel for channel in _useful(inspection) if channel.role == "state"]
+    useful = useful or list(inspection.channels)
     split: dict[str, Any] = {}
     reasons: list[str] = []
     rates = [channel.rate_hz for channel in useful if channel.rate_hz]

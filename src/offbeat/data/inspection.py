@@ -22,6 +22,7 @@ class ChannelInspection:
     Attributes:
         name: of the channel.
         unit: or empty.
+        role: one of `ROLES`.
         known: number of known values.
         missing: fraction of the rows in which it is not known.
         rate_hz: one over the median time between two known values; None below two.
@@ -41,6 +42,7 @@ class ChannelInspection:
 
     name: str
     unit: str
+    role: str
     known: int
     missing: float
     rate_hz: float | None
@@ -163,7 +165,12 @@ def _channel(dataset: Dataset, c: int, rows: int) -> ChannelInspection:
     steps = [np.diff(t.times[at]) for t, at in zip(dataset, known, strict=True)]
     together = np.concatenate(steps)
     count = sum(len(at) for at in known)
-    described = {"name": dataset.names[c], "unit": dataset.units[c], "known": count}
+    described = {
+        "name": dataset.names[c],
+        "unit": dataset.units[c],
+        "role": dataset.roles[c],
+        "known": count,
+    }
     if not count:
         return ChannelInspection(
             **described,  # type: ignore[arg-type]
