@@ -1,8 +1,8 @@
-"""The models of the benchmark once more, as their users write them: eager PyTorch, and JAX.
+"""The models of `training_step.py`, written in eager PyTorch and in JAX.
 
-Both take the weights and the step inputs of our own model, so that every contestant computes
-the same loss (`training_step.py` checks that it does). Each does what a careful user of the library
-would: input projections, decays and x-hat for all rows at once, then a loop over rows.
+Both take the weights and the step inputs of the Offbeat model, so that all compute the same loss
+(`training_step.py` checks it). Each is written as a careful user of the library would: input
+projections, decays and x-hat for all rows at once, then a loop over rows.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ def weights_of(model: ob.Model) -> dict[str, torch.Tensor]:
     return {name: p.detach().clone() for name, p in model.named_parameters()}
 
 
-def facts_of(rows: StepInputs, targets: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Facts with rows first, as a loop wants them."""
-    names = ("gap", "update", "values", "mask", "age", "decay_end", "last")
-    facts = {"targets": targets.transpose(0, 1).contiguous()}
+def inputs_of(rows: StepInputs, targets: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Step inputs and targets with rows first, for a loop over rows."""
+    names = ("gap", "update", "values", "mask", "time_input", "decay_end", "last")
+    found = {"targets": targets.transpose(0, 1).contiguous()}
     for name in names:
         value = getattr(rows, name)
         if value is not None:
             value = value[..., None] if value.ndim == 2 else value
-            facts[name] = value.transpose(0, 1).contiguous()
-    return facts
+            found[name] = value.transpose(0, 1).contiguous()
+    return found
 
 
 def loss(xp: Any, model: SimpleNamespace, p: dict[str, Any], f: dict[str, Any]) -> Any:
     """Mean squared error of the one-step-ahead prediction, over rows after the first.
 
     Args:
-        xp: the library: `tanh`, `exp`, `cat`, ..., `flow` over a gap and `loop` over rows.
-        model: channels, hidden, anchored, feeding forms of the parts.
+        xp: the library: `tanh`, `exp`, `cat`, ..., `propagate` over a gap and `loop` over rows.
+        model: sizes and parts of the model, as `shape_of` has them.
         p: weights by name.
-        f: facts, rows first.
+        f: step inputs and targets, rows first.
     """
     n, c = model.hidden, model.channels
 
@@ -54,13 +54,13 @@ def loss(xp: Any, model: SimpleNamespace, p: dict[str, Any], f: dict[str, Any]) 
             x = activation(x) if i < layers - 1 else x
         return x
 
-    shown = f["values"]
+    values = f["values"]
     if model.input_decay:
         exponent = p["input_decay.weight"] * f["decay_end"] + p["input_decay.bias"]
         gamma = xp.exp(-xp.positive(exponent))
-        faded = gamma * f["last"] + (1 - gamma) * model.mean
-        shown = xp.where(f["mask"] > 0, shown, faded)
-    parts = [shown, f["mask"], *([f["age"]] if "age" in f else [])]
+        decayed = gamma * f["last"] + (1 - gamma) * model.mean
+        values = xp.where(f["mask"] > 0, values, decayed)
+    parts = [values, f["mask"], *([f["time_input"]] if "time_input" in f else [])]
     rows = {"gate": xp.cat(parts, -1) @ p["cell.inputs"].T + p["cell.bias"]}
     rows |= {name: f[name] for name in ("gap", "update", "values", "mask")}
     if model.decay:
@@ -72,7 +72,7 @@ def loss(xp: Any, model: SimpleNamespace, p: dict[str, Any], f: dict[str, Any]) 
         if model.decay:
             state = state * row["decay"]
         if model.field:
-            state = xp.flow(lambda y: perceptron(y, "field", activation), state, row["gap"])
+            state = xp.propagate(lambda y: perceptron(y, "field", activation), state, row["gap"])
         before, gate, h = state, row["gate"], state
         if model.anchored:
             x, h = state[:, :c], state[:, c:]
@@ -92,13 +92,13 @@ def loss(xp: Any, model: SimpleNamespace, p: dict[str, Any], f: dict[str, Any]) 
     before, after = xp.loop(step, first, rows)
     if model.anchored:
         predictions = before[1:, :, :c] * model.std + model.mean
-    else:  # the row before tells what comes next
-        predictions = perceptron(after[:-1], "decoder", xp.tanh)
+    else:  # from the state after the row before
+        predictions = perceptron(after[:-1], "head.decoder", xp.tanh)
     return ((predictions - f["targets"][1:]) ** 2).mean()
 
 
 def shape_of(model: ob.Model) -> SimpleNamespace:
-    """What `loss` must know of a model."""
+    """The sizes and parts of a model that `loss` depends on."""
     return SimpleNamespace(
         channels=model.channels,
         hidden=model.hidden_size,
@@ -122,7 +122,7 @@ def torch_library(*, torchdiffeq: bool) -> SimpleNamespace:
 
         if float(gap[0, 0]) == 0:
             return y
-        # One grid for the batch is all that it has; here all gaps of a row are equal.
+        # torchdiffeq takes one time grid for the batch; here all gaps of a row are equal.
         times = torch.stack([torch.zeros(()), gap[0, 0]])
         return odeint(lambda _, state: field(state), y, times, method="euler")[-1]
 
@@ -142,33 +142,33 @@ def torch_library(*, torchdiffeq: bool) -> SimpleNamespace:
         cat=torch.cat,
         where=torch.where,
         zeros=torch.zeros,
-        flow=by_library if torchdiffeq else lambda field, y, gap: y + gap * field(y),
+        propagate=by_library if torchdiffeq else lambda field, y, gap: y + gap * field(y),
         loop=loop,
     )
 
 
-class TorchContestant:
+class TorchStep:
     """A training step of eager PyTorch with its own Adamax."""
 
-    def __init__(self, model: ob.Model, facts: dict[str, torch.Tensor]) -> None:
+    def __init__(self, model: ob.Model, inputs: dict[str, torch.Tensor]) -> None:
         self.weights = {k: v.requires_grad_() for k, v in weights_of(model).items()}
-        self.shape, self.facts = shape_of(model), facts
+        self.shape, self.inputs = shape_of(model), inputs
         self.xp = torch_library(torchdiffeq=bool(model.spec.field))
         self.optimizer = torch.optim.Adamax(list(self.weights.values()), lr=1e-3)
 
     def __call__(self) -> float:
         """One step; the loss before it."""
-        value = loss(self.xp, self.shape, self.weights, self.facts)
+        value = loss(self.xp, self.shape, self.weights, self.inputs)
         self.optimizer.zero_grad()
         value.backward()
         self.optimizer.step()
         return float(value.detach())
 
 
-class JaxContestant:
+class JaxStep:
     """A training step of JAX: one jitted function, a `lax.scan` over rows, Adamax inside."""
 
-    def __init__(self, model: ob.Model, facts: dict[str, torch.Tensor]) -> None:
+    def __init__(self, model: ob.Model, inputs: dict[str, torch.Tensor]) -> None:
         import jax
         from jax import lax
         from jax import numpy as jnp
@@ -182,12 +182,12 @@ class JaxContestant:
             cat=lambda parts, axis: jnp.concatenate(parts, axis),
             where=jnp.where,
             zeros=jnp.zeros,
-            flow=lambda field, y, gap: y + gap * field(y),
+            propagate=lambda field, y, gap: y + gap * field(y),
             loop=lambda step, state, rows: lax.scan(step, state, rows)[1],
         )
         shape = shape_of(model)
         shape.mean, shape.std = jnp.asarray(shape.mean.numpy()), jnp.asarray(shape.std.numpy())
-        self.facts = {k: jnp.asarray(v.numpy()) for k, v in facts.items()}
+        self.inputs = {k: jnp.asarray(v.numpy()) for k, v in inputs.items()}
         self.weights = {k: jnp.asarray(v.numpy()) for k, v in weights_of(model).items()}
         zeros = {k: jnp.zeros_like(v) for k, v in self.weights.items()}
         self.moments = (zeros, zeros, jnp.zeros(()))
@@ -208,5 +208,5 @@ class JaxContestant:
 
     def __call__(self) -> float:
         """One step; the loss before it."""
-        value, self.weights, self.moments = self.step(self.weights, self.moments, self.facts)
+        value, self.weights, self.moments = self.step(self.weights, self.moments, self.inputs)
         return float(value)

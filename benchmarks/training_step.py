@@ -18,93 +18,94 @@ from typing import Any, NamedTuple
 
 import torch
 from common import machine, synthetic, write
-from peers import JaxContestant, TorchContestant, facts_of
+from peers import JaxStep, TorchStep, inputs_of
 
 import offbeat as ob
 from offbeat import kernels
+from offbeat.models.zoo import recipe_of
 from offbeat.run import RunState, flat_parameters
 from offbeat.training import Examples, train_step
 
 MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
 
 
-class Contestant(NamedTuple):
-    """A step, which returns the loss before it, and what to be in while it is timed."""
+class Step(NamedTuple):
+    """A training step, which returns the loss before it, and the context that it is timed in."""
 
     step: Callable[[], float]
     around: Callable[[], AbstractContextManager[Any]] = nullcontext
 
 
-def ours(config: ob.ModelConfig, data: ob.Dataset, body: str) -> Contestant:
-    """A training step of this library in one of its bodies."""
+def offbeat_step(config: ob.ModelConfig, data: ob.Dataset, backend: str) -> Step:
+    """A training step of Offbeat with one of its backends."""
     model = ob.make_model(config, data, seed=0)
     examples = Examples(model, model.batch(data))
-    training = ob.TrainConfig()
-    state = RunState(flat_parameters(model).__enter__(), training)
+    recipe = recipe_of(model.name, ob.TrainConfig(), validated=False)
+    state = RunState(flat_parameters(model).__enter__(), recipe)
     index = torch.arange(len(examples))
 
     def step() -> float:
-        return train_step(model, examples, index, state, training, total=1)
+        return train_step(model, examples, index, state, recipe, total=1)
 
-    def around() -> ExitStack:  # as `fit` enters once for all of a training
+    def around() -> ExitStack:  # `fit` enters it once per training
         stack = ExitStack()
-        stack.enter_context(kernels.use(body))
+        stack.enter_context(kernels.use(backend))
         stack.enter_context(model.threads())
         return stack
 
-    return Contestant(step, around)
+    return Step(step, around)
 
 
-def contestants(name: str, data: ob.Dataset) -> dict[str, Contestant]:
-    """Everyone who can run a model here."""
+def steps_of(name: str, data: ob.Dataset) -> dict[str, Step]:
+    """The implementations that can run a model here."""
     config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
     model = ob.make_model(config, data, seed=0)
     batch = model.batch(data)
     rows, _ = model.step_inputs(batch)
-    facts = facts_of(rows, batch.values)
-    found: dict[str, Contestant] = {}
+    inputs = inputs_of(rows, batch.values)
+    found: dict[str, Step] = {}
     if kernels.cpu.instruction_sets():
-        found["ours, fused"] = ours(config, data, "fused")
-    found["ours, reference"] = ours(config, data, "reference")
-    found["eager torchdiffeq" if model.spec.field else "eager torch"] = Contestant(
-        TorchContestant(model, facts)
+        found["Offbeat, cpu"] = offbeat_step(config, data, "cpu")
+    found["Offbeat, reference"] = offbeat_step(config, data, "reference")
+    found["eager torchdiffeq" if model.spec.field else "eager torch"] = Step(
+        TorchStep(model, inputs)
     )
     if importlib.util.find_spec("jax"):
-        found["JAX, jitted scan"] = Contestant(JaxContestant(model, facts))
+        found["JAX, jitted scan"] = Step(JaxStep(model, inputs))
     return found
 
 
 def measure(name: str, data: ob.Dataset, repeats: int) -> dict[str, Any]:
-    """Times of all contestants in turn, ms."""
-    everyone = contestants(name, data)
+    """Times of all implementations in turn, ms."""
+    steps = steps_of(name, data)
 
-    def timed(who: str) -> tuple[float, float]:
-        contestant = everyone[who]
-        with contestant.around():
-            time.sleep(0.02)  # the idle threads of the contestant before go to sleep
+    def timed(which: str) -> tuple[float, float]:
+        step, around = steps[which]
+        with around():
+            time.sleep(0.02)  # until the idle threads of the step before sleep
             start = time.perf_counter()
-            loss = contestant.step()
+            loss = step()
             return loss, 1e3 * (time.perf_counter() - start)
 
-    first = {who: timed(who)[0] for who in everyone}
-    expected = first["ours, reference"]
-    for who, loss in first.items():
+    first = {which: timed(which)[0] for which in steps}
+    expected = first["Offbeat, reference"]
+    for which, loss in first.items():
         if abs(loss - expected) > 1e-4 * abs(expected):
-            raise SystemExit(f"{name}: {who} computes the loss {loss}, the reference {expected}")
-    for who in everyone:
-        timed(who)
-    times: dict[str, list[float]] = {who: [] for who in everyone}
+            raise SystemExit(f"{name}: {which} computes the loss {loss}, the reference {expected}")
+    for which in steps:
+        timed(which)
+    times: dict[str, list[float]] = {which: [] for which in steps}
     for _ in range(repeats):
-        for who in everyone:
-            times[who].append(timed(who)[1])
-    own = times.get("ours, fused", times["ours, reference"])
+        for which in steps:
+            times[which].append(timed(which)[1])
+    own = times.get("Offbeat, cpu", times["Offbeat, reference"])
     result = {}
-    for who, each in times.items():
+    for which, each in times.items():
         ratio = statistics.median(t / o for t, o in zip(each, own, strict=True))
-        result[who] = {
+        result[which] = {
             "median_ms": round(statistics.median(each), 2),
             "fastest_ms": round(min(each), 2),
-            "median_ratio_to_fused": round(ratio, 2),
+            "median_ratio_to_cpu": round(ratio, 2),
         }
     return result
 
@@ -124,10 +125,10 @@ def main() -> None:
     found = {}
     for name in options.models:
         found[name] = measure(name, data, options.repeats)
-        for who, numbers in found[name].items():
+        for which, numbers in found[name].items():
             print(
-                f"{name:20} {who:18} {numbers['median_ms']:8.1f} ms   "
-                f"x{numbers['median_ratio_to_fused']:.2f}",
+                f"{name:20} {which:18} {numbers['median_ms']:8.1f} ms   "
+                f"x{numbers['median_ratio_to_cpu']:.2f}",
                 flush=True,
             )
     write(options.json, {"machine": machine(), "options": vars(options), "steps": found})

@@ -4,7 +4,7 @@
 
 Each checkout runs in a process of its own, with its `src` on the path and its compiled module
 there. The processes take turns: one trains for some steps while the other waits. The script uses
-only what all versions since 0.1.0 have: `make_model`, `fit` and its history.
+only what all versions since 0.1.0 have.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ def trajectory():
     return ob.Trajectory(np.arange(options["rows"]) * 0.005, values, observed)
 
 data = ob.Dataset(tuple(trajectory() for _ in range(options["batch"] * options["steps"])))
-training = ob.TrainConfig(epochs=1, batch_size=options["batch"])
 backend = kernels.backend if hasattr(kernels, "backend") else kernels.body  # 0.1.0
 print(json.dumps({"version": ob.__version__, "backend": backend()[0]}), flush=True)
 for line in sys.stdin:
@@ -47,6 +46,7 @@ for line in sys.stdin:
     config = ob.thesis_config(name) if thesis else ob.ModelConfig(name=name)
     make = ob.make_model if hasattr(ob, "make_model") else ob.make  # 0.1.0
     model = make(config, data, seed=0)
+    training = ob.train_config(name, epochs=1, batch_size=options["batch"])
     epoch = ob.fit(model, data, None, training, progress=False).history[-1]
     print(1e3 * epoch.seconds / options["steps"], epoch.train_mse, flush=True)
 """
