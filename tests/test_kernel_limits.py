@@ -258,6 +258,33 @@ def test_weights_of_the_wrong_size_are_refused(size: int) -> None:
         run({}, "baseline", weights=np.zeros(size, np.float32))
 
 
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"steps_per_gap": 2**27}, "steps_per_gap is 134217728, expected 1 to 1000000"),
+        ({"steps_per_gap": 2**31 - 1}, "steps_per_gap is 2147483647"),
+        ({"steps_per_gap": 2**40}, "steps_per_gap is 1099511627776"),
+        ({"max_step": 1e-300}, "needs more than 1000000 steps of at most max_step"),
+    ],
+)
+def test_models_and_streams_refuse_more_steps_than_there_can_be(
+    option: dict[str, Any], message: str
+) -> None:
+    times = np.arange(5) / 10
+    data = ob.Dataset((ob.Trajectory(times, np.sin(times)[:, None] * [1.0, 2.0]),))
+    model = ob.make_model("ode_rnn", data, **option)
+    with pytest.raises(ob.InputError, match=message):
+        ob.predict(model, data)
+
+    def stream() -> None:
+        live = ob.Stream(model)
+        for t in times:
+            live.step(float(t), np.ones(2))
+
+    with pytest.raises(ob.InputError, match=message):
+        stream()
+
+
 # --- shapes and values that compute ---------------------------------------------------------------
 
 SHAPES: dict[str, tuple[dict[str, Any], int, int]] = {

@@ -40,14 +40,14 @@ else:
     why_not = ""
 
 TAPE_LIMIT = 256 * 2**20
-"""Bytes. A forward pass that would keep more than this for its backward pass keeps only the states
-(`state_size` floats per row, twice), and the backward pass computes the rest again, a few rows at a
-time (`benchmarks/scaling.py` says what that costs)."""
+"""Bytes. A forward pass stores inner activations for its backward pass up to this size. Beyond it
+stores only the states (`state_size` numbers per row, twice), and the backward pass recomputes the
+rest, a few rows at a time (`benchmarks/scaling.py` measures the cost)."""
 
 ROWS_AT_ONCE = 0
-"""Rows whose gradients of weights are added up in one go; more of them wait in memory. 0: eight
-evaluations, whichever rows those are (`benchmarks/scaling.py` says what others cost). It changes no
-bit: each sum has its order."""
+"""Rows whose weight gradients are added together; 0 for as many as have eight evaluations of the
+vector field (`benchmarks/scaling.py` measures others). It does not change the bits: the order of
+each sum is fixed."""
 
 _CELLS = {"none": 0, "start": 1, "elman": 2, "lstm": 3, "gru": 4}
 _ACTIVATIONS = {"tanh": 0, "silu": 1}
@@ -148,7 +148,7 @@ def scan(
 
     Raises:
         RuntimeError: this backend cannot run this scan.
-        ValueError: shapes disagree.
+        InputError: shapes disagree, or a size is over a limit of the compiled module.
     """
     if reason := unsupported(spec, parts, inputs, state):
         raise RuntimeError(f"the cpu backend cannot run this scan: {reason}")
@@ -196,7 +196,7 @@ def _array(tensor: Tensor | None) -> Any:
     return tensor.detach().numpy()
 
 
-def _facts(rows: StepInputs | TableSteps, suffix: str) -> Any:
+def _inputs(rows: StepInputs | TableSteps, suffix: str) -> Any:
     made = getattr(compiled, f"StepInputs_{suffix}")
     fed = torch.frombuffer(bytearray(rows.fed), dtype=torch.uint8).numpy() if rows.fed else None
     if isinstance(rows, TableSteps):
@@ -210,8 +210,8 @@ def _facts(rows: StepInputs | TableSteps, suffix: str) -> Any:
             fed,
             _array(rows.length),
         )
-    facts = (_array(getattr(rows, name)) for name in QUANTITIES)
-    return made(*facts, _array(rows.mean), fed, _array(rows.length))
+    given = (_array(getattr(rows, name)) for name in QUANTITIES)
+    return made(*given, _array(rows.mean), fed, _array(rows.length))
 
 
 class _Scan(Function):
@@ -220,28 +220,28 @@ class _Scan(Function):
         ctx: Any,
         spec: ScanSpec,
         rows: StepInputs | TableSteps,
-        body: str,
+        variant: str,
         keep: bool,
         packed: Tensor,
         state: Tensor,
     ) -> tuple[Tensor, Tensor]:
         own = compiled_spec(spec)
-        facts = _facts(rows, _TYPES[state.dtype])
+        inputs = _inputs(rows, _TYPES[state.dtype])
         state = state.contiguous()
         first = _array(state)
         before = state.new_empty((len(rows), rows.rows, spec.state_size))
         after = torch.empty_like(before)
         tape = None
         if keep:
-            size = compiled.tape_size(own, body, facts, first)
+            size = compiled.tape_size(own, variant, inputs, first)
             if size * state.element_size() <= TAPE_LIMIT:
                 tape = state.new_empty(size)
         ctx.threads = threads()
         compiled.scan_forward(
-            own, body, _array(packed), facts, first, _array(before), _array(after), _array(tape),
-            ctx.threads,
+            own, variant, _array(packed), inputs, first, _array(before), _array(after),
+            _array(tape), ctx.threads,
         )  # fmt: skip
-        ctx.own, ctx.facts, ctx.body, ctx.rows = own, facts, body, rows
+        ctx.own, ctx.inputs, ctx.variant, ctx.rows = own, inputs, variant, rows
         # What is returned must be kept this way: as attributes it would never be freed.
         ctx.save_for_backward(packed, state, after, tape)
         ctx.set_materialize_grads(False)
@@ -254,9 +254,9 @@ class _Scan(Function):
         to_packed, to_state = torch.empty_like(packed), torch.empty_like(state)
         compiled.scan_backward(
             ctx.own,
-            ctx.body,
+            ctx.variant,
             _array(packed),
-            ctx.facts,
+            ctx.inputs,
             _array(state),
             _array(after),
             _array(tape),
@@ -273,20 +273,20 @@ class _Scan(Function):
 # --- a perceptron over many rows ------------------------------------------------------------------
 
 
-def perceptron(layers: Layers, x: Tensor, activation: str, body: str | None = None) -> Tensor:
+def perceptron(layers: Layers, x: Tensor, activation: str, variant: str | None = None) -> Tensor:
     """Applies a perceptron to (..., inputs); a row's result depends on that row alone, bit for bit.
 
     Args:
         layers: weights and biases.
         x: (..., inputs) float32 or float64 on the CPU.
         activation: `tanh` or `silu`, between the layers.
-        body: name of a compiled backend; by default the best one.
+        variant: name of an instruction set; by default the best one.
     """
     sizes = (layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers))
     packed = torch.cat([tensor.reshape(-1) for layer in layers for tensor in layer])
     flat = x.reshape(-1, sizes[0])
     result = _Perceptron.apply(  # type: ignore[no-untyped-call]
-        sizes, activation, body or instruction_sets()[0], torch.is_grad_enabled(), packed, flat
+        sizes, activation, variant or instruction_sets()[0], torch.is_grad_enabled(), packed, flat
     )
     return cast(Tensor, result).reshape(*x.shape[:-1], sizes[-1])
 
@@ -315,7 +315,7 @@ class _Perceptron(Function):
         ctx: Any,
         sizes: tuple[int, ...],
         activation: str,
-        body: str,
+        variant: str,
         keep: bool,
         packed: Tensor,
         x: Tensor,
@@ -324,13 +324,13 @@ class _Perceptron(Function):
         y = x.new_empty((len(x), sizes[-1]))
         tape = None
         if keep:
-            size = getattr(compiled, f"perceptron_tape_{_TYPES[x.dtype]}")(shape, body, len(x))
+            size = getattr(compiled, f"perceptron_tape_{_TYPES[x.dtype]}")(shape, variant, len(x))
             tape = x.new_empty(size)
         ctx.threads = threads()
         compiled.perceptron_forward(
-            shape, body, _array(packed), _array(x), _array(y), _array(tape), ctx.threads
+            shape, variant, _array(packed), _array(x), _array(y), _array(tape), ctx.threads
         )
-        ctx.shape, ctx.body = shape, body
+        ctx.shape, ctx.variant = shape, variant
         ctx.save_for_backward(packed, x, tape)
         return y
 
@@ -342,7 +342,7 @@ class _Perceptron(Function):
         to_x = x.new_empty(x.shape) if ctx.needs_input_grad[-1] else None
         compiled.perceptron_backward(
             ctx.shape,
-            ctx.body,
+            ctx.variant,
             _array(packed),
             _array(x),
             _array(tape),

@@ -35,11 +35,12 @@ def scan(
     after: list[Tensor] = []
     decays = _decays(spec, parts, inputs)
     gates = _gates(spec, parts, inputs)
+    each_gate = [None] * inputs.rows if gates is None else gates.unbind(1)
     gaps, updates = inputs.gap[..., None].unbind(1), inputs.update[..., None].unbind(1)
     shortest = inputs.rows if inputs.length is None else int(inputs.length.min())
-    for i, (gap, update, decay) in enumerate(zip(gaps, updates, decays, strict=True)):
+    steps = zip(gaps, updates, decays, each_gate, strict=True)
+    for i, (gap, update, decay, gate) in enumerate(steps):
         old = state
-        gate = gates[:, i] if gates is not None else None
         if inputs.fed and inputs.fed[i]:
             gate = _fed_gate(spec, parts, inputs, state, i)
         state = _propagate(spec, parts, gap, decay, state)
