@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -307,3 +308,131 @@ def test_a_folder_that_is_no_checkpoint_or_a_newer_one_is_refused(tmp_path):
     (folder / "config.json").write_text(json.dumps({**facts, "version": 3}))
     with pytest.raises(ob.FileFormatError, match="checkpoint version 3"):
         ob.load_model(folder)
+
+
+# --- what must be the same for a run to go on -----------------------------------------------------
+
+
+def _bursts(data):
+    return ob.mask_out(data, 0.5, mask="bursts", burst_rows=4, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (lambda d: ob.mask_out(d, 0.5, seed=4), "training set"),
+        (_bursts, "training set"),
+        (lambda d: d.take(range(len(d) - 1, -1, -1)), "training set"),
+        (
+            lambda d: ob.Dataset(
+                tuple(replace(t, units=("furlong",) * t.channels) for t in d), d.meta
+            ),
+            "training set",
+        ),
+    ],
+    ids=["another mask", "bursts", "another order", "another unit"],
+)
+def test_a_run_does_not_go_on_with_other_training_data(changed, message, tmp_path):
+    """In 0.1.0 only counts and sums were compared, so each of these went on in silence."""
+    whole = swinging(8)
+    data = ob.mask_out(whole, 0.5, seed=3)
+    config = ob.TrainConfig(epochs=1, batch_size=4)
+    model = ob.make_model("gru", data, **SMALL)
+    ob.fit(model, data, config=config, out=tmp_path, progress=False)
+    before = weights(ob.load_model(tmp_path))
+    other = changed(data if "order" in message else whole)
+    if other.units != data.units:
+        other = changed(data)
+    again = ob.make_model("gru", data, **SMALL)
+    again.units = other.units
+    more = ob.TrainConfig(epochs=2, batch_size=4)
+    with pytest.raises(ob.InputError, match=message):
+        ob.fit(again, other, config=more, out=tmp_path, progress=False)
+    assert same(weights(ob.load_model(tmp_path)), before)
+
+
+def test_a_run_does_not_go_on_with_another_validation_set(tmp_path):
+    config = ob.TrainConfig(epochs=1, batch_size=4)
+    ob.fit(
+        ob.make_model("gru", TRAIN, **SMALL), TRAIN, VALIDATION, config, out=tmp_path,
+        progress=False,
+    )  # fmt: skip
+    other = ob.mask_out(VALIDATION, 0.5, seed=1)
+    with pytest.raises(ob.InputError, match="validation set"):
+        ob.fit(
+            ob.make_model("gru", TRAIN, **SMALL), TRAIN, other,
+            ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path, progress=False,
+        )  # fmt: skip
+
+
+# --- recipes, devices, callbacks ------------------------------------------------------------------
+
+
+def test_without_a_config_a_model_trains_with_its_own_recipe():
+    recipes = {
+        name: ob.fit(
+            ob.make_model(name, TRAIN, **SMALL), TRAIN, VALIDATION, ob.TrainConfig(epochs=1),
+            progress=False,
+        ).recipe
+        for name in ("gru", "anchored_ode_gru_d")
+    }  # fmt: skip
+    gru, anchored = recipes["gru"], recipes["anchored_ode_gru_d"]
+    assert (gru.optimizer, gru.learning_rate, gru.schedule) == ("adamax", 1e-3, "constant")
+    assert (anchored.optimizer, anchored.learning_rate) == ("adam", 2e-3)
+    assert (anchored.schedule, anchored.clip_norm) == ("cosine", 1.0)
+    assert {r.keep for r in recipes.values()} == {"best"}, "there is a validation set"
+    alone = ob.fit(
+        ob.make_model("gru", TRAIN, **SMALL), TRAIN, config=ob.TrainConfig(epochs=1), progress=False
+    )
+    assert alone.recipe.keep == "last"
+
+
+def test_what_is_asked_for_replaces_the_recipe():
+    asked = ob.TrainConfig(epochs=1, optimizer="sgd", clip_norm=math.inf, keep="last")
+    model = ob.make_model("anchored_ode_gru_d", TRAIN, **SMALL)
+    recipe = ob.fit(model, TRAIN, VALIDATION, asked, progress=False).recipe
+    assert (recipe.optimizer, recipe.clip_norm, recipe.keep) == ("sgd", math.inf, "last")
+    assert recipe.learning_rate == 2e-3
+
+
+def test_a_validation_set_of_which_nothing_counts_is_refused():
+    """0.1.0 kept the last weights in silence."""
+    once = ob.Dataset(
+        tuple(replace(t, observed=np.zeros_like(t.observed)) for t in swinging(3)), {}
+    )
+    with pytest.raises(ob.InputError, match="no value of the validation set counts"):
+        ob.fit(
+            ob.make_model("gru", TRAIN, **SMALL), TRAIN, once,
+            ob.TrainConfig(epochs=1, keep="best"), progress=False,
+        )  # fmt: skip
+
+
+def test_a_callback_sees_every_epoch_and_can_stop():
+    seen = []
+
+    def callback(record, model):
+        seen.append((record.epoch, model.name))
+        return record.epoch == 2
+
+    result = ob.fit(
+        ob.make_model("gru", TRAIN, **SMALL), TRAIN, config=ob.TrainConfig(epochs=5),
+        callbacks=[callback], progress=False,
+    )  # fmt: skip
+    assert seen == [(1, "gru"), (2, "gru")]
+    assert result.stopped_early
+
+
+def test_a_device_is_named_and_the_model_stays_there():
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    ob.fit(model, TRAIN, config=ob.TrainConfig(epochs=1), device="cpu", progress=False)
+    assert model.device.type == "cpu"
+    with pytest.raises(ob.InputError, match="device 'gpu'"):
+        ob.fit(model, TRAIN, config=ob.TrainConfig(epochs=1), device="gpu", progress=False)
+
+
+def test_a_checkpoint_records_the_backend_that_ran(tmp_path):
+    """0.1.0 recorded the instruction set of the processor although the reference ran."""
+    model = ob.make_model("ode_rnn", TRAIN, **SMALL, solver="dopri5")
+    ob.fit(model, TRAIN, config=ob.TrainConfig(epochs=1), out=tmp_path, progress=False)
+    (folder,) = (tmp_path / "checkpoints").iterdir()
+    assert json.loads((folder / "config.json").read_text())["training"]["backend"] == "reference"

@@ -103,7 +103,7 @@ def fit(
     recipe = recipe_of(model.name, asked, validated=validation is not None)
     folder = writable(out, folder=True) if out is not None else None
     if device is not None:
-        model.to(device)
+        model.to(_device(device))
     batch = model.batch(train)
     validated = None
     if validation is not None:
@@ -125,6 +125,16 @@ def fit(
                     "asked for; give another folder"
                 )
         return _fit(model, batch, validated, recipe, state, folder, identity, callbacks, progress)
+
+
+def _device(name: str | torch.device) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"there is no device {name!r}; give cpu, cuda or cuda:1") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"there is no device {name!r} here: torch finds no CUDA; give cpu")
+    return device
 
 
 def _fit(

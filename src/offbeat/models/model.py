@@ -96,6 +96,7 @@ class Model(BaseModel):
             units=tuple(config.decoder_units or ()),
             mean=self.mean.clone(),
             std=self.std.clone(),
+            actions=tuple(i for i, role in enumerate(self.roles) if role == ACTION),
         )
         self.head = HEADS[config.head or "point"](shape)
         self._initialise(seed)

@@ -44,6 +44,7 @@ class HeadShape:
         units: hidden layers of the head's perceptron.
         mean: (channels,) training mean, scaled units.
         std: (channels,) training standard deviation, scaled units.
+        actions: positions of the channels with the role `action`.
     """
 
     channels: int
@@ -52,6 +53,7 @@ class HeadShape:
     units: tuple[int, ...]
     mean: Tensor
     std: Tensor
+    actions: tuple[int, ...] = ()
 
 
 class Head(nn.Module):
@@ -73,6 +75,12 @@ class Head(nn.Module):
         self.anchored = shape.anchored
         self.register_buffer("mean", shape.mean, persistent=False)
         self.register_buffer("std", shape.std, persistent=False)
+        # An observation sets the channels that it has, and only h learns of it: what to do about it
+        # is read off x and h together.
+        self.actions, self.policy = list(shape.actions), None
+        if shape.anchored and shape.actions:
+            width = shape.channels + shape.hidden_size
+            self.policy = Perceptron((width, *shape.units, len(shape.actions)), "tanh")
 
     def decode(self, state: Tensor) -> Prediction:
         """(..., state_size) states to a prediction of (..., channels) in scaled units."""
@@ -102,8 +110,16 @@ class Head(nn.Module):
         return state[..., first : first + self.hidden_size]
 
     def held(self, state: Tensor) -> Tensor:
-        """(..., channels) the channels of an anchored state, in scaled units."""
-        return state[..., : self.channels] * self.std + self.mean
+        """(..., channels) the channels of an anchored state, in scaled units.
+
+        Actions, where there are any, are decoded from the whole state.
+        """
+        x = state[..., : self.channels]
+        if self.policy is not None:
+            driven = state[..., : self.channels + self.hidden_size]
+            chosen = perceptron(self.policy.layers, driven, "tanh")
+            x = x.index_copy(-1, torch.tensor(self.actions, device=x.device), chosen)
+        return x * self.std + self.mean
 
 
 class Point(Head):
