@@ -221,7 +221,7 @@ def test_a_forward_that_gives_no_prediction_is_refused_in_one_line(entries):
             return batch.values
 
     ob.register_model("wrong", Wrong)
-    with pytest.raises(ob.InputError, match="'wrong' gave .* expected a Prediction whose mean"):
+    with pytest.raises(ob.InputError, match=r"'wrong' gave .* expected a Prediction whose mean"):
         ob.evaluate(ob.make_model("wrong", dataset(3)), dataset(3))
 
 
@@ -282,5 +282,5 @@ def test_an_unknown_part_lists_the_choices(options, message):
 
 
 def test_an_unknown_kind_of_part_lists_the_kinds():
-    with pytest.raises(ob.InputError, match="unknown kind of part 'sell'.*cell"):
+    with pytest.raises(ob.InputError, match=r"unknown kind of part 'sell'.*cell"):
         ob.register_part("sell", "x", Cell)

@@ -50,7 +50,7 @@ def runs(mask: np.ndarray) -> list[int]:
     return [len(list(group)) for value, group in groupby(mask) if value]
 
 
-# --- fractions -------------------------------------------------------------------------------------
+# --- fractions ------------------------------------------------------------------------------------
 
 
 @given(st.integers(1, 120), st.integers(1, 99), st.integers(1, 12))
