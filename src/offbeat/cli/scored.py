@@ -123,7 +123,7 @@ def forecast_figure(
         method: replace(ahead, values=baselines.forecast(truth, ahead.times, method, mean))
         for method in baselines.FORECASTERS
     }
-    drawn[model.config.name] = ahead
+    drawn[model.name] = ahead
     start = int(np.searchsorted(truth.times, truth.times[-1] - 4 * horizons[-1]))
     end = truth.slice(min(start, truth.rows - 1), truth.rows)
     save(answers(end, drawn, channels, title=truth.origin), path)
