@@ -161,7 +161,7 @@ def test_two_processes_train_the_same_models_as_one(made, tmp_path, capsys):
 
 def test_an_error_in_a_process_that_trains_is_raised_here(copy):
     (copy / "settings.json").unlink()  # so that only the runs in the folder can tell
-    with pytest.raises(InputError, match="holds a run with another"):
+    with pytest.raises(InputError, match="holds another run"):
         run_demo(copy, workers=2, **{**TINY, "n_trajectories": 41})
     assert multiprocessing.active_children() == []
 

@@ -1,0 +1,36 @@
+"""A run that Offbeat 0.1.0 made still works with this version."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from offbeat.cli.app import main
+
+
+def test_a_run_of_0_1_0_still_predicts_fills_and_scores(tmp_path, capsys):
+    old = Path(__file__).parent / "data" / "run_0_1_0"
+    log, run = str(old / "log.csv"), str(old / "run")
+    for command, name in (("predict", "predictions.csv"), ("impute", "filled.csv")):
+        assert main([command, run, log, str(tmp_path / name)]) == 0
+        got, then = (
+            list(csv.reader(path.read_text().splitlines()))
+            for path in (tmp_path / name, old / name)
+        )
+        assert got[0] == then[0]
+        numbers = [i for i, text in enumerate(then[1]) if text not in ("true", "false")]
+        for row, was in zip(got[1:], then[1:], strict=True):
+            assert [float(row[i]) for i in numbers] == pytest.approx(
+                [float(was[i]) for i in numbers], rel=1e-5, abs=1e-6
+            )
+    capsys.readouterr()
+    assert main(["evaluate", run, log, "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    then = json.loads((old / "run" / "results.json").read_text())
+    assert scores["part"] == "test"
+    for name, was in then["predictors"].items():
+        got = scores["predictors"][name]["after_first_observation"]["rmse"]
+        assert got == pytest.approx(was["honest"]["rmse"], rel=1e-5)
+    for name, rmse in then["imputation"]["rmse_scaled"].items():
+        assert scores["imputation"]["rmse_scaled"][name] == pytest.approx(rmse, rel=1e-5)
