@@ -3,8 +3,10 @@
 import csv
 import json
 import math
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -17,11 +19,11 @@ from offbeat.comparison import Run, compare, read_runs
 from offbeat.comparison.run_files import LAST_VALUE, METRICS
 from offbeat.comparison.runs import parse_only
 from offbeat.comparison.statistics import friedman, holm, paired_comparison, thesis_test
-from offbeat.comparison.text import escape
 from offbeat.errors import FileFormatError, InputError
 from offbeat.metrics import SCORINGS
 from offbeat.plots.ranks import ranks_figure
 from offbeat.plots.style import STYLES, style_of
+from offbeat.tables import escape_latex
 
 LEVELS = {"gru": 0.030, "ode_rnn": 0.0275, "ode_gru_d": 0.027, "anchored_ode_gru_d": 0.019}
 
@@ -390,7 +392,7 @@ def test_latex_is_balanced_and_escaped(record):
     assert r"anchored\_ode\_gru\_d" in latex
     assert "gru_d" not in latex.replace(r"\_", "")
     assert latex.count("{") == latex.count("}")
-    assert escape("50 % of a_b & <c> \\ {d} ^~#$") == (
+    assert escape_latex("50 % of a_b & <c> \\ {d} ^~#$") == (
         r"50 \% of a\_b \& $<$c$>$ \textbackslash{} \{d\} \textasciicircum{}\textasciitilde{}\#\$"
     )
 
@@ -459,6 +461,32 @@ def runs(tmp_path_factory):
             ]  # fmt: skip
             assert main([str(a) for a in arguments]) == 0
     return folder
+
+
+def test_runs_and_tables_of_the_version_before_are_read_under_the_names_of_now(runs, tmp_path):
+    old = {"after_first_observation": "honest", "masked": "honest_hidden"}
+    old["after_first_row"] = "rows_1_99"
+    for name in ("rnn-4-0", "gru-4-0"):
+        folder = shutil.copytree(runs / name, tmp_path / name)
+        config = (folder / "config.yaml").read_text().replace("\nsplit:\n", "\nparts:\n")
+        (folder / "config.yaml").write_text(config)
+        results = json.loads((folder / "results.json").read_text())
+        results["predictors"] = {
+            who: {old.get(key, key): value for key, value in scores.items()}
+            for who, scores in results["predictors"].items()
+        }
+        (folder / "results.json").write_text(json.dumps(results))
+        (before,), (now,) = read_runs(folder), read_runs(runs / name)
+        assert replace(before, name="") == replace(now, name="")
+    table = tmp_path / "record.csv"
+    table.write_text(
+        "model,repeat,kernel_body,honest_mse,rows_1_99_mse,last_value_honest_mse\n"
+        "gru,0,avx2,0.25,0.5,4.0\n"
+    )
+    (run,) = read_runs(table)
+    assert run.mse == {"after_first_observation": 0.25, "after_first_row": 0.5}
+    assert run.last_value_mse == {"after_first_observation": 4.0}
+    assert run.origin == {"scan_backend": "avx2"}
 
 
 def test_folders_are_paired_by_the_cut_of_the_data_and_sizes_are_told_apart(runs, capsys):

@@ -17,6 +17,7 @@ STAGES = (
     "errors",
     "registry",
     "files",
+    "tables",
     "config",
     "data",
     "ode",

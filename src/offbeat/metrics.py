@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from offbeat.data.batch import Batch, delta, last_index, last_values
+from offbeat.tables import plain
 
 SCORINGS = ("after_first_observation", "masked", "after_first_row", "published")
 """The scorings, always by these names."""
@@ -131,8 +132,7 @@ class ScoreSums:
         shown = torch.where(mask[:, 0], 0.0, batch.values[:, 0].double() ** 2)
         self._add("published", torch.cat([shown[:, None], squared[:, 1:]], dim=1), known)
         if self.gap_unit is not None:
-            since = delta(batch.times, mask) / self.gap_unit
-            group = torch.ceil(torch.log2(since.clamp_min(1.0)) - 1e-6).long()
+            group = gap_groups(delta(batch.times, mask), self.gap_unit)
             for k in torch.unique(group[counted]).tolist():
                 self._add(int(k), squared, counted & (group == k))
 
@@ -161,6 +161,19 @@ class ScoreSums:
         entries = int(count.sum())
         mse = float(total.sum()) / entries if entries else float("nan")
         return Score(mse, tuple((total / count).tolist()), entries)
+
+
+def gap_groups(elapsed: Tensor, unit: float) -> Tensor:
+    """Groups of gaps by length: 0 up to the unit, then k up to 2^k units.
+
+    Args:
+        elapsed: s, any shape.
+        unit: s.
+
+    Returns:
+        Integers of the same shape.
+    """
+    return torch.ceil(torch.log2((elapsed / unit).clamp_min(1.0)) - 1e-6).long()
 
 
 def last_value_predictions(batch: Batch, mean: Tensor) -> Tensor:
@@ -199,19 +212,9 @@ def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None)
         rows: scores by predictor.
         notes: a remark per predictor, shown at the end of its line.
     """
-    titles = ("predictor", "RMSE", "masked only", "after row 0", "published")
-    lines: list[tuple[str, ...]] = [titles]
-    ranked = sorted(rows.items(), key=lambda item: item[1].after_first_observation.mse)
-    for name, scores in ranked:
-        numbers = (_shown(getattr(scores, s).rmse) for s in SCORINGS)
-        lines.append((name, *numbers))
-    widths = [max(len(line[i]) for line in lines) for i in range(len(titles))]
-    text = []
-    for name_, line in zip(("", *(name for name, _ in ranked)), lines, strict=True):
-        cells = (
-            c.ljust(w) if i == 0 else c.rjust(w)
-            for i, (c, w) in enumerate(zip(line, widths, strict=True))
-        )
-        note = (notes or {}).get(name_, "")
-        text.append("  ".join([*cells, note]).rstrip())
-    return "\n".join(text)
+    notes = notes or {}
+    lines = [["predictor", "RMSE", "masked only", "after row 0", "published", ""]]
+    for name, scores in sorted(rows.items(), key=lambda item: item[1].after_first_observation.mse):
+        numbers = (_shown(getattr(scores, scoring).rmse) for scoring in SCORINGS)
+        lines.append([name, *numbers, notes.get(name, "")])
+    return plain(lines, left=(0, 5))

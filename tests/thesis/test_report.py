@@ -73,7 +73,7 @@ def test_learning_curves_draw_the_root_of_each_logged_error(x, first):
 def test_the_axes_of_learning_curves_say_what_they_count_and_in_which_units():
     axes = figures.learning_curves({"gru": log(0.5)}, x="steps", units="deviations").axes[0]
     assert axes.get_xlabel() == "Optimizer steps"
-    assert axes.get_ylabel() == "Honest validation RMSE (deviations)"
+    assert axes.get_ylabel() == "Validation RMSE (deviations)"
     assert figures.learning_curves({"gru": log(0.5)}).axes[0].get_xlabel() == "Epoch"
 
 

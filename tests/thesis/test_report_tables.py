@@ -11,7 +11,6 @@ import pytest
 import record_helpers as made
 from scipy import stats
 
-from offbeat.comparison.table import MIXED, Block, Cell, Table, bold_lowest
 from offbeat.errors import InputError
 from thesis.report import (
     convergence,
@@ -23,6 +22,7 @@ from thesis.report import (
     tables_tests,
 )
 from thesis.report import thesis_numbers as thesis
+from thesis.report.table import MIXED, Block, Cell, Table, bold_lowest
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 from offbeat.comparison.statistics import FriedmanResult
-from offbeat.comparison.table import Table
 from offbeat.errors import MissingExtraError
 from offbeat.plots.ranks import ranks_figure
 from thesis.illustrations import Illustrations
@@ -29,6 +28,7 @@ from thesis.report.findings import Finding
 from thesis.report.page import Picture
 from thesis.report.pairing import FAMILIES, MODELS, Pair, Rule, family, ranks, thesis_rule
 from thesis.report.records import Record
+from thesis.report.table import Table
 from thesis.report.tables import label, percent
 
 

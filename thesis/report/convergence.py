@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.comparison.statistics import convergence, enough_epochs, paired_comparison, settling
-from offbeat.comparison.table import MIXED, Block, Cell, Table
 from offbeat.errors import InputError
 from thesis.report import findings as say
 from thesis.report import thesis_numbers as thesis
 from thesis.report.findings import Verdict
 from thesis.report.pairing import MODELS, Pair, corrected, too_few
 from thesis.report.records import Record
+from thesis.report.table import MIXED, Block, Cell, Table
 from thesis.report.tables import COUNTED, by_fraction, label, percent
 from thesis.report.tables_tests import signed
 

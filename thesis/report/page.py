@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from offbeat.comparison.table import Table
 from thesis.report import svg
 from thesis.report.findings import (
     FAILS,
@@ -18,6 +17,7 @@ from thesis.report.findings import (
     UNDECIDED,
     Finding,
 )
+from thesis.report.table import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,8 +18,8 @@ from offbeat.comparison.statistics import (
     thesis_test,
 )
 from offbeat.comparison.statistics.samples import FEWEST
-from offbeat.comparison.table import MINUS
 from offbeat.errors import InputError
+from offbeat.tables import MINUS
 from thesis.protocol import CONTROLS
 from thesis.report import thesis_numbers as thesis
 from thesis.report.records import Record

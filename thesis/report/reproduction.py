@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offbeat.comparison.table import Table
 from offbeat.errors import InputError
 from offbeat.files import writable, write_text
 from offbeat.plots import figures
@@ -18,6 +17,7 @@ from thesis.report.document import document
 from thesis.report.page import Picture
 from thesis.report.records import Record, read_record
 from thesis.report.summary import summary as summarised
+from thesis.report.table import Table
 
 PAGE = "report.html"
 SUMMARY = "summary.md"

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from offbeat.comparison.statistics import SpreadComparison, holm, spread_comparison
-from offbeat.comparison.table import MIXED, Block, Cell, Table
 from offbeat.errors import InputError
 from thesis.report import findings as say
 from thesis.report import thesis_numbers as thesis
 from thesis.report.findings import Verdict
 from thesis.report.pairing import MODELS, paired_rmse, too_few
 from thesis.report.records import Record
+from thesis.report.table import MIXED, Block, Cell, Table
 from thesis.report.tables import COUNTED, HEADINGS, by_fraction, label, percent, rmse_of
 
 _OURS = "ode_gru_d"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.comparison.table import DASH, Table
+from offbeat.tables import DASH, markdown
 from thesis.protocol import CONTROLS
 from thesis.report import findings as say
 from thesis.report import thesis_numbers as thesis
@@ -15,6 +15,7 @@ from thesis.report.circumstances import machine_rows, time_rows
 from thesis.report.contents import Contents
 from thesis.report.pairing import FAIR, FAMILIES, MODELS, ODE, PLAIN, Pair
 from thesis.report.records import Record
+from thesis.report.table import Table
 from thesis.report.tables import PERCENTS, label, rmse_of
 from thesis.report.tables_beyond import constant_of
 from thesis.report.tables_tests import p_cell, signed
@@ -382,9 +383,7 @@ def _grid(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     rows = list(rows)
     if all(cell == DASH for row in rows for cell in row[1:]):
         return f"{head[0]}: {say.MISSING}, runs are missing."
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    lines += ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join(lines)
+    return markdown(head, rows)
 
 
 def _embedded(table: Table) -> str:

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.comparison.table import DASH, MIXED, Block, Cell, Table, bold_lowest
 from offbeat.plots.style import style_of
+from offbeat.tables import DASH
 from thesis.report import thesis_numbers as thesis
 from thesis.report.records import Record
+from thesis.report.table import MIXED, Block, Cell, Table, bold_lowest
 
 HEADINGS = {
     "thesis": "Thesis",

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.comparison.table import MINUS, MIXED, TIMES, Block, Cell, Table, bold_lowest
+from offbeat.tables import MINUS, TIMES
 from thesis.report import thesis_numbers as thesis
 from thesis.report.pairing import MODELS
 from thesis.report.records import Record
+from thesis.report.table import MIXED, Block, Cell, Table, bold_lowest
 from thesis.report.tables import (
     HEADINGS,
     PERCENTS,

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from offbeat.comparison.statistics import FriedmanResult, shapiro_wilk
-from offbeat.comparison.table import MINUS, MIXED, Block, Cell, Table
 from offbeat.errors import InputError
+from offbeat.tables import MINUS
 from thesis.protocol import CONTROLS
 from thesis.report import thesis_numbers as thesis
 from thesis.report.pairing import FAIR, Pair, Rule
 from thesis.report.records import Record
+from thesis.report.table import MIXED, Block, Cell, Table
 from thesis.report.tables import (
     HEADINGS,
     LAST_VALUE,

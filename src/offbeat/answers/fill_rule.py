@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from offbeat.errors import InputError
+from offbeat.metrics import gap_groups
 
 GROUPS = 16
 """Lengths are grouped at 1, 2, 4, ... times the median gap; longer ones are in the last group."""
@@ -109,7 +111,7 @@ class FillRule:
 
 def group_of(length: _Array, unit: float) -> NDArray[np.int64]:
     """The group of gaps of a length in s."""
-    group = np.ceil(np.log2(np.maximum(length / unit, 1.0)) - 1e-6).astype(np.int64)
+    group: NDArray[np.int64] = gap_groups(torch.from_numpy(length), unit).numpy()
     return np.minimum(group, GROUPS - 1)
 
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat import tables
 from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
 from offbeat.answers.predict import in_model_order, predict
@@ -17,6 +19,7 @@ from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
+from offbeat.metrics import gap_groups
 from offbeat.models.base import BaseModel
 
 OVERALL = "all, scaled"
@@ -55,7 +58,7 @@ class ChannelScores:
             lines.append([name, unit or "-", str(count), *numbers])
         overall = [_shown(self.overall[p]) for p in predictors]
         lines.append([OVERALL, "-", str(sum(self.counts)), *overall])
-        return _aligned(lines)
+        return tables.plain(lines)
 
     def verdict(self) -> str:
         """Which predictor is best, in words, and where a trivial one is."""
@@ -175,7 +178,7 @@ class ImputationScores:
         for up_to, scores in self.inside:
             numbers = [_shown(scores.overall[p]) for p in predictors]
             lines.append([f"{up_to:.3g} s", str(sum(scores.counts)), *numbers])
-        by_gap = f"\nscaled, by time between the observations around:\n{_aligned(lines)}"
+        by_gap = f"\nscaled, by time between the observations around:\n{tables.plain(lines)}"
         return self.scores.table() + (by_gap if self.inside else "")
 
     def verdict(self) -> str:
@@ -256,7 +259,7 @@ def score_imputation(
         each = {name: values[i] for name, values in fills.items()}
         sums.add(trajectory.values, each, counted)
         length = _gap_lengths(trajectory)
-        group = np.ceil(np.log2(np.maximum(length / unit, 1.0)) - 1e-6).astype(int)
+        group = gap_groups(torch.from_numpy(length), unit).numpy()
         for k in np.unique(group[counted & (length > 0)]).tolist():
             chosen = counted & (length > 0) & (group == k)
             grouped.setdefault(k, _sums_for(forward)).add(trajectory.values, each, chosen)
@@ -365,14 +368,3 @@ def _plain(value: float) -> float | None:
 
 def _shown(value: float) -> str:
     return "-" if value != value else f"{value:.4g}"
-
-
-def _aligned(lines: list[list[str]]) -> str:
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    return "\n".join(
-        "  ".join(
-            text.ljust(w) if i == 0 else text.rjust(w)
-            for i, (text, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from offbeat.data.inspection import EpisodeInspection, Inspection
+from offbeat.tables import plain
 
 _MOST_EPISODES = 12
 
@@ -55,7 +54,7 @@ def channel_table(inspection: Inspection) -> str:
         "repeated",
         "range",
     )
-    return _table([header, *rows], left=(0, 1, 7, 8))
+    return plain([header, *rows], left=(0, 1, 7, 8))
 
 
 def episode_table(inspection: Inspection) -> str:
@@ -89,7 +88,7 @@ def episode_table(inspection: Inspection) -> str:
         "late",
         "duplicates",
     )
-    text = _table([header, *rows], left=(1, 5))
+    text = plain([header, *rows], left=(1, 5))
     if len(shown) == len(episodes):
         return text
     clean = len(episodes) - sum(_is_faulty(e) for _, e in episodes)
@@ -117,15 +116,3 @@ def _number(value: float | None, digits: int) -> str:
     if value is None:
         return ""
     return f"{value if abs(value) >= 1e-6 else 0.0:.{digits}g}"
-
-
-def _table(rows: Sequence[Sequence[str]], left: Sequence[int]) -> str:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [
-            cell.ljust(width) if i in left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)

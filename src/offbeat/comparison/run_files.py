@@ -49,8 +49,8 @@ class RawRun:
         condition: what was asked of it, by name.
         shown: those of them that stand in every label.
         settings: of model and training, without seeds.
-        seeds: what tells repeats apart, the first as far as it does.
-        facts: all that runs may be chosen by.
+        seeds: that differ between repeats; the first alone where it is enough.
+        choices: all that runs may be chosen by.
         mse: by metric, NaN where nothing counted.
         last_value_mse: by metric.
         draw: of windows and masks.
@@ -63,7 +63,7 @@ class RawRun:
     shown: tuple[str, ...]
     settings: Mapping[str, Any]
     seeds: tuple[str, ...]
-    facts: Mapping[str, Any]
+    choices: Mapping[str, Any]
     mse: Mapping[str, float]
     last_value_mse: Mapping[str, float]
     draw: str
@@ -118,7 +118,7 @@ def _read_folder(folder: Path) -> RawRun:
             for key, value in values.items()
             if key not in _NOT_SETTINGS
         }
-        facts = {**training, **model, **condition, "model": name, "seed": config["seed"]}
+        choices = {**training, **model, **condition, "model": name, "seed": config["seed"]}
         return RawRun(
             str(folder),
             name,
@@ -128,7 +128,7 @@ def _read_folder(folder: Path) -> RawRun:
             ),
             settings,
             (f"split.seed {draw}", f"seed {config['seed']}"),
-            facts,
+            choices,
             {metric: _mse(_named(scores[name], metric)) for metric in METRICS},
             {metric: _mse(_named(scores[LAST_VALUE], metric)) for metric in METRICS},
             draw,

@@ -20,7 +20,7 @@ class Run:
     Attributes:
         name: its folder, or its id in a table.
         model: label of the model; runs with the same label are repeats of each other.
-        condition: what was asked of it: data, observed share, experiment. Only runs under the same
+        condition: data, observed fraction, experiment. Only runs under the same
             condition are compared.
         repeat: pairs the runs of different models: those of one repeat share windows and masks.
         mse: mean squared error on the test part by metric, in scaled units; NaN where nothing
@@ -47,7 +47,7 @@ def read_runs(
 
     A folder of `offbeat train` is a run: its model is the name in config.yaml, its condition the
     data and how it was cut, its repeat the seed of the cut. Where several runs of a model share
-    that seed, the seed of the weights tells them apart. Runs of one name under one condition whose
+    that seed, the seed of the weights pairs them. Runs of one name under one condition whose
     settings differ get the settings into their label: `gru[hidden_size=32]`.
 
     A table has a row per run, with columns `model`, `repeat` and `<metric>_mse` (such as
@@ -68,8 +68,8 @@ def read_runs(
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     raws = [raw for path in given for raw in read_raw(Path(path))]
     for key, wanted in (only or {}).items():
-        one_of("name to choose runs by", key, {name for raw in raws for name in raw.facts})
-        raws = [raw for raw in raws if key in raw.facts and _same(raw.facts[key], wanted)]
+        one_of("name to choose runs by", key, {name for raw in raws for name in raw.choices})
+        raws = [raw for raw in raws if key in raw.choices and _same(raw.choices[key], wanted)]
     if not raws:
         chosen = ", ".join(f"{k}={v}" for k, v in (only or {}).items())
         raise InputError(
@@ -110,9 +110,9 @@ def _label(raws: Sequence[RawRun]) -> tuple[Run, ...]:
     for (_, model), group in groups.items():
         differ = _differing([raw.settings for raw in group])
         for raw in group:
-            told = ", ".join(f"{key.split('.')[-1]}={raw.settings.get(key)}" for key in differ)
-            models[id(raw)] = f"{model}[{told}]" if told else model
-    # One seed is enough to pair by where it tells all repeats of each model apart.
+            named = ", ".join(f"{key.split('.')[-1]}={raw.settings.get(key)}" for key in differ)
+            models[id(raw)] = f"{model}[{named}]" if named else model
+    # One seed is enough to pair by where it differs in all repeats of each model.
     for depth in range(1, max(len(raw.seeds) for raw in raws) + 1):
         keys = [
             (c, models[id(raw)], raw.seeds[:depth]) for c, raw in zip(conditions, raws, strict=True)

@@ -77,23 +77,23 @@ def paired_tables(
         InputError: runs do not pair, or nothing is left.
     """
     found: dict[str, tuple[tuple[str, ...], dict[str, Sample]]] = {}
-    faults = []
+    reasons = []
     for condition in scores.conditions:
         there = {m: scores.table[condition][m] for m in chosen if m in scores.table[condition]}
         every = list(dict.fromkeys(repeat for runs in there.values() for repeat in runs))
         lacking = {m: [r for r in every if r not in runs] for m, runs in there.items()}
         kept = [r for r in every if all(r in runs for runs in there.values())]
         if len(there) < 2:
-            faults.append(
+            reasons.append(
                 f"{condition}: only {', '.join(there) or 'models that were not asked for'}"
             )
             continue
         if baseline is not None and baseline not in there:
-            faults.append(f"{condition}: the baseline {baseline!r} has no run")
+            reasons.append(f"{condition}: the baseline {baseline!r} has no run")
             continue
         if len(kept) < FEWEST:
             runs = ", ".join(f"{m} {len(r)}" for m, r in there.items())
-            faults.append(
+            reasons.append(
                 f"{condition}: the models share {len(kept)} repeats, at least {FEWEST} are needed "
                 f"(runs per model: {runs})"
             )
@@ -114,8 +114,8 @@ def paired_tables(
             {m: np.array([r[k] for k in kept]) for m, r in there.items()},
         )
     if not found:
-        raise InputError(f"nothing to compare: {'; '.join(faults)}")
-    notes += [f"Left out: {fault}" for fault in faults]
+        raise InputError(f"nothing to compare: {'; '.join(reasons)}")
+    notes += [f"Left out: {reason}" for reason in reasons]
     return found
 
 

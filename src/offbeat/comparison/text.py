@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from offbeat import tables
 from offbeat.comparison.results import Comparison, ConditionResult, PairResult
 from offbeat.comparison.run_files import LAST_VALUE
 from offbeat.comparison.statistics.ranks import FriedmanResult
@@ -51,12 +50,10 @@ def markdown(comparison: Comparison) -> str:
     parts = [_heading(comparison)]
     for condition in comparison.conditions:
         parts.append(f"## {condition.condition}")
-        for grid in grids(comparison, condition):
-            lines = [grid.head, ("---", *("---:",) * (len(grid.head) - 1)), *grid.rows]
-            body = "\n".join(
-                "| " + " | ".join(c.replace("|", "\\|") for c in r) + " |" for r in lines
-            )
-            parts.append(f"{grid.title}\n\n{body}")
+        parts += [
+            f"{grid.title}\n\n{tables.markdown(grid.head, grid.rows, right=True)}"
+            for grid in grids(comparison, condition)
+        ]
         parts += [_ranks(condition.friedman)] if condition.friedman else []
     return "\n\n".join([*parts, "\n".join(f"- {note}" for note in _notes(comparison))]) + "\n"
 
@@ -66,23 +63,11 @@ def latex(comparison: Comparison) -> str:
     parts = [f"% {_heading(comparison)}"]
     for condition in comparison.conditions:
         for grid in grids(comparison, condition):
-            rows = [" & ".join(map(escape, row)) + r" \\" for row in grid.rows]
-            lines = [
-                r"\begin{table}",
-                r"  \centering",
-                rf"  \caption{{{escape(f'{condition.condition}. {grid.title}')}}}",
-                rf"  \begin{{tabular}}{{l{'r' * (len(grid.head) - 1)}}}",
-                r"    \toprule",
-                "    " + " & ".join(map(escape, grid.head)) + r" \\",
-                r"    \midrule",
-                *(f"    {row}" for row in rows),
-                r"    \bottomrule",
-                r"  \end{tabular}",
-                r"\end{table}",
-            ]
-            parts.append("\n".join(lines))
-        parts += [escape(_ranks(condition.friedman))] if condition.friedman else []
-    return "\n\n".join([*parts, *map(escape, _notes(comparison))]) + "\n"
+            rows = [[tables.escape_latex(text) for text in row] for row in grid.rows]
+            caption = f"{condition.condition}. {grid.title}"
+            parts.append(tables.latex(grid.head, [("", rows)], caption=caption))
+        parts += [tables.escape_latex(_ranks(condition.friedman))] if condition.friedman else []
+    return "\n\n".join([*parts, *map(tables.escape_latex, _notes(comparison))]) + "\n"
 
 
 def to_dict(comparison: Comparison) -> dict[str, Any]:
@@ -167,16 +152,6 @@ def grids(comparison: Comparison, condition: ConditionResult) -> tuple[Grid, Gri
     return models, paired, rule
 
 
-def escape(words: str) -> str:
-    """Text for LaTeX."""
-    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    return re.sub(r"[\\~^&%$#_{}<>]", lambda m: special.get(m[0], _escaped(m[0])), words)
-
-
-def _escaped(letter: str) -> str:
-    return f"${letter}$" if letter in "<>" else f"\\{letter}"
-
-
 def _heading(comparison: Comparison) -> str:
     against = f", against {comparison.baseline}" if comparison.baseline else ""
     return (
@@ -200,7 +175,7 @@ def _ranks(found: FriedmanResult) -> str:
     return (
         f"Friedman: chi-squared {found.statistic:.3f} ({found.friedman.df[0]:g} df), p "
         f"{_p(found.p)}, over {found.blocks} repeats. Nemenyi: critical difference of mean ranks "
-        f"{found.critical_difference:.2f}; not told apart: {groups}."
+        f"{found.critical_difference:.2f}; not significantly different: {groups}."
     )
 
 
@@ -211,13 +186,7 @@ def _finding(pair: PairResult) -> str:
 
 
 def _plain_grid(grid: Grid) -> str:
-    lines: Sequence[tuple[str, ...]] = (grid.head, *grid.rows)
-    widths = [max(len(line[i]) for line in lines) for i in range(len(grid.head))]
-    shown = [
-        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])])
-        for line in lines
-    ]
-    return "\n".join([f"{grid.title}:", *(line.rstrip() for line in shown)])
+    return f"{grid.title}:\n{tables.plain([grid.head, *grid.rows])}"
 
 
 def _number(value: float, digits: int = 4) -> str:

@@ -48,7 +48,7 @@ def learning_curves(
 
     Args:
         histories: per model its training log, one entry per epoch.
-        last_value_rmse: honest RMSE of the last-value predictor on the same validation part,
+        last_value_rmse: RMSE of the last-value predictor on the same validation part,
             drawn as a dashed horizontal line.
         x: count `epochs` or optimizer `steps`.
         units: of the error, as the axis names them.
@@ -87,7 +87,7 @@ def learning_curves(
         axes.set_yscale("log")
         axes.set_xlim(left=0)
         axes.set_xlabel("Epoch" if x == "epochs" else "Optimizer steps")
-        axes.set_ylabel(f"Honest validation RMSE ({units})")
+        axes.set_ylabel(f"Validation RMSE ({units})")
         axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
         # An error seldom spans a decade: label 1, 2, 3, 5 of each, in plain numbers.
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))

@@ -146,10 +146,10 @@ def _draw_lane(
             color=_GAP,
         )
     else:
-        share = _covered(dataset, lane.channels[0], 1 / facts.rate_hz, starts, edges)
+        fraction = _covered(dataset, lane.channels[0], 1 / facts.rate_hz, starts, edges)
         image = np.ones((1, _BINS, 4))
         image[0, :, :3] = _rgb(_HELD if lane.held else _MEASURED)
-        image[0, :, 3] = share
+        image[0, :, 3] = fraction
         axes.imshow(
             image,
             extent=(edges[0], edges[-1], row + 0.36, row - 0.36),
@@ -177,7 +177,7 @@ def _covered(
     starts: NDArray[np.float64],
     edges: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(bins,) share of each stretch of time in which the channel keeps to its rate."""
+    """(bins,) fraction of each bin in which the channel keeps to its rate."""
     total = np.zeros(len(edges) - 1)
     width = edges[1] - edges[0]
     for trajectory, start in zip(dataset, starts, strict=True):
@@ -195,8 +195,8 @@ def _covered(
         # One that is alone in its stretch is seen all the same.
         place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(total) - 1)
         np.maximum.at(total, place, 0.25 * width)
-    share: NDArray[np.float64] = np.clip(total / width, 0.0, 1.0)
-    return share
+    fraction: NDArray[np.float64] = np.clip(total / width, 0.0, 1.0)
+    return fraction
 
 
 def _marks(

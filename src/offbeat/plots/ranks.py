@@ -1,4 +1,4 @@
-"""The critical-difference diagram: average ranks of models, and which are not told apart."""
+"""The critical-difference diagram: average ranks of models, and groups that do not differ."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ class Style:
 
     Attributes:
         label: its name in legends and captions.
-        colour: hexadecimal, told apart by colour-blind readers.
+        colour: hexadecimal, from a palette for colour-blind readers.
         marker: of points.
         dash: line style of matplotlib; with it, lines stay apart in black and white.
     """

@@ -187,7 +187,7 @@ class PairedComparison:
             values are all equal.
         hedges_g: in units of the models' spread over repeats (form `average`), with interval.
         hedges_gz: in units of the spread of the differences (form `difference`), with interval.
-        wins: share of the pairs in which the first is lower; a tie counts half.
+        wins: fraction of the pairs in which the first is lower; a tie counts half.
     """
 
     runs: int

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -135,8 +134,3 @@ def check_level(name: str, value: float) -> float:
     if isinstance(value, bool) or not (isinstance(value, int | float) and 0 < value < 1):
         raise InputError(f"{name} must lie between 0 and 1, got {value!r}; 0.05 means 5 %")
     return float(value)
-
-
-def finite_or_none(value: float) -> float | None:
-    """A number as JSON knows it."""
-    return value if math.isfinite(value) else None

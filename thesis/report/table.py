@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 import html
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from offbeat.errors import InputError
+from offbeat.tables import DASH, escape_latex, latex, markdown
 
 MIXED = "†"
 """Marks a number whose runs were not made alike: code, processor, scan backend, torch, data."""
-
-MINUS, DASH, TIMES = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{MULTIPLICATION SIGN}"
 
 
 @dataclass(frozen=True)
@@ -110,42 +108,33 @@ class Table:
 
     def to_markdown(self) -> str:
         """A table as GitHub shows it, the caption above it, the notes below."""
-        lines = [f"**Table {self.number}.** {self.caption}", ""]
-        lines.append("| " + " | ".join([self.corner, *self.columns]) + " |")
-        lines.append("|" + "---|" * (1 + len(self.columns)))
+        rows: list[list[str]] = []
         for block in self.blocks:
             if len(self.blocks) > 1:
-                lines.append(f"| *{block.heading}* |" + " |" * len(self.columns))
+                rows.append([f"*{block.heading}*", *("",) * len(self.columns)])
             for label, cells in block.rows:
                 shown = [f"**{c.text}**{c.mark}" if c.bold else c.text + c.mark for c in cells]
-                lines.append("| " + " | ".join([label, *shown]) + " |")
-        return "\n".join([*lines, *(f"\n{note}" for note in self.notes)]) + "\n"
+                rows.append([label, *shown])
+        shown_table = markdown((self.corner, *self.columns), rows)
+        caption = f"**Table {self.number}.** {self.caption}"
+        return "\n".join([caption, "", shown_table, *(f"\n{note}" for note in self.notes)]) + "\n"
 
     def to_latex(self) -> str:
         """A `table` environment for the package booktabs."""
-        width = 1 + len(self.columns)
-        lines = [
-            r"\begin{table}",
-            r"  \centering",
-            rf"  \caption{{{_latex(self.caption)}}}",
-            rf"  \label{{tab:{self.slug.removeprefix('table-')}}}",
-            r"  \small",
-            rf"  \begin{{tabular}}{{l{'r' * len(self.columns)}}}",
-            r"    \toprule",
-            "    " + " & ".join(_latex(c) for c in (self.corner, *self.columns)) + r" \\",
+        headed = len(self.blocks) > 1
+        blocks = [
+            (
+                block.heading if headed else "",
+                [
+                    [escape_latex(label), *(_latex_cell(cell) for cell in cells)]
+                    for label, cells in block.rows
+                ],
+            )
+            for block in self.blocks
         ]
-        for block in self.blocks:
-            lines.append(r"    \midrule")
-            if len(self.blocks) > 1:
-                lines.append(
-                    rf"    \multicolumn{{{width}}}{{l}}{{\emph{{{_latex(block.heading)}}}}} \\"
-                )
-            for label, cells in block.rows:
-                shown = [_latex_cell(cell) for cell in cells]
-                lines.append("    " + " & ".join([_latex(label), *shown]) + r" \\")
-        lines += [r"    \bottomrule", r"  \end{tabular}"]
-        lines += [rf"  \par\smallskip\footnotesize {_latex(note)}" for note in self.notes]
-        return "\n".join([*lines, r"\end{table}"]) + "\n"
+        label = self.slug.removeprefix("table-")
+        head = (self.corner, *self.columns)
+        return latex(head, blocks, caption=self.caption, label=label, notes=self.notes) + "\n"
 
     def to_html(self) -> str:
         """A `table` element with caption and header cells, in a box that scrolls sideways."""
@@ -211,34 +200,6 @@ def _html_cell(cell: Cell) -> str:
     return text + (f"<sup>{_html(cell.mark)}</sup>" if cell.mark else "")
 
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "#": r"\#",
-    "_": r"\_",
-    "$": r"\$",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "±": r"$\pm$",
-    TIMES: r"$\times$",
-    MINUS: "$-$",
-    DASH: "--",
-    "†": r"$^{\dagger}$",
-    "≤": r"$\leq$",
-    "<": r"$<$",
-    ">": r"$>$",
-    "\N{THIN SPACE}": r"\,",
-}
-_LATEX_SPECIAL = re.compile("|".join(re.escape(c) for c in _LATEX))
-
-
-def _latex(text: str) -> str:
-    return _LATEX_SPECIAL.sub(lambda found: _LATEX[found[0]], text)
-
-
 def _latex_cell(cell: Cell) -> str:
-    text = rf"\textbf{{{_latex(cell.text)}}}" if cell.bold else _latex(cell.text)
-    return text + _latex(cell.mark)
+    text = rf"\textbf{{{escape_latex(cell.text)}}}" if cell.bold else escape_latex(cell.text)
+    return text + escape_latex(cell.mark)
