@@ -11,7 +11,7 @@ from offbeat.config import ModelConfig, TrainConfig
 from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import Dataset
 from offbeat.metrics import row_0_constant
-from offbeat.models.model import Model
+from offbeat.models.base import BaseModel
 from offbeat.sweeps import plan
 from offbeat.sweeps.provenance import provenance
 from offbeat.sweeps.running import SweepResult, run_plan
@@ -79,7 +79,7 @@ class ThesisPlan(plan.Plan):
         return provenance_here()
 
     def columns(
-        self, run: plan.Run, model: Model, test: Dataset, recorded: Dataset
+        self, run: plan.Run, model: BaseModel, test: Dataset, recorded: Dataset
     ) -> dict[str, Any]:
         """The constant c of the masked first rows, their fraction, and the simulator."""
         batch = model.batch(test)

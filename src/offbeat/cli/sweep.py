@@ -57,23 +57,23 @@ def sweep_command(
         reader: options of the log's format: --reader.format NAME, --reader.OPTION VALUE.
         json: print the comparison as JSON.
     """
+    from offbeat.config import TrainConfig
     from offbeat.errors import one_of
     from offbeat.files import writable
-    from offbeat.models.zoo import ZOO, train_config
+    from offbeat.models.zoo import list_models
     from offbeat.sweeps.sweep import sweep
 
     models = list(MODELS if models is None else models)
     for name in models:
-        one_of("model", name, ZOO)
+        one_of("model", name, list_models())
     writable(out, folder=True)
-    recipes = {name: train_config(name, **{"keep": "best", **(training or {})}) for name in models}
     done = sweep(
         read_log(data, reader),
         models,
         out=out,
         repeats=repeats,
         split=split,
-        training=recipes,
+        training=TrainConfig(**(training or {})),
         scaler=scaler,
         engine=engine,
         processes=processes,

@@ -12,7 +12,7 @@ from offbeat.sweeps.record import Record
 if TYPE_CHECKING:
     from offbeat.data.scaler import Scaler
     from offbeat.data.trajectory import Dataset
-    from offbeat.models.model import Model
+    from offbeat.models.base import BaseModel
 
 Parts = tuple["Dataset", "Dataset", "Dataset"]
 """Training, validation and test part."""
@@ -109,7 +109,9 @@ class Plan(ABC):
         """Optimizer steps of a run; None where they are not known before."""
         return None
 
-    def columns(self, run: Run, model: Model, test: Dataset, recorded: Dataset) -> dict[str, Any]:
+    def columns(
+        self, run: Run, model: BaseModel, test: Dataset, recorded: Dataset
+    ) -> dict[str, Any]:
         """More columns of a run's row.
 
         Args:

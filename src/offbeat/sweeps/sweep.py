@@ -20,7 +20,7 @@ from offbeat.sweeps.provenance import provenance
 from offbeat.sweeps.running import SweepResult, run_plan
 
 if TYPE_CHECKING:
-    from offbeat.models.model import Model
+    from offbeat.models.base import BaseModel
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,9 @@ class SweepPlan(Plan):
         """Of this process, as it stood when it was first asked."""
         return _provenance()
 
-    def columns(self, run: Run, model: Model, test: Dataset, recorded: Dataset) -> dict[str, Any]:
+    def columns(
+        self, run: Run, model: BaseModel, test: Dataset, recorded: Dataset
+    ) -> dict[str, Any]:
         """The condition, which is the same for all runs."""
         split = self.split
         window = split.window if split.window_s is None else f"{split.window_s:g} s"
@@ -151,13 +153,14 @@ def sweep(
 
     Args:
         dataset: the trajectories.
-        models: names of the zoo or configs; a mapping gives them labels of their own.
+        models: names or configs; a mapping gives them labels of their own. A model of one's own
+            must be known to other processes: by an entry point of the group `offbeat.models`.
         out: folder: `record.parquet` and `.csv` (a line per run, the last-value predictor's scores
             among them), `curves.*` (a line per epoch), `status.json`, `data/`, `runs/`.
         repeats: how many.
         split: windows, masks and split; its seed is that of the first repeat.
-        training: of all models, or by label; by default the recipe of each model, with the
-            weights of the best validation error.
+        training: of all models, or by label; what it leaves open is the recipe of the model. The
+            weights with the best validation error are kept.
         epochs: replaces those of `training`.
         scaler: `standardise`, `min_max`, `divide_by_max` or `identity`, fitted on the training part
             of each repeat.
@@ -220,14 +223,15 @@ def _choices(
             raise InputError(
                 f"the label {label!r} names a folder; use letters, digits, '_', '-' and '.'"
             )
-    by_label = training if isinstance(training, Mapping) else {}
+    by_label = training if isinstance(training, Mapping) else dict.fromkeys(labels, training)
     for label in by_label:
         one_of("label of training", label, labels)
     found = []
     for label, config in zip(labels, configs, strict=True):
-        own = by_label.get(label) if training is None or by_label else training
-        own = own if isinstance(own, TrainConfig) else train_config(config.name, keep="best")
-        found.append((label, config, own if epochs is None else replace(own, epochs=epochs)))
+        given = asdict(by_label.get(label) or TrainConfig())
+        asked = {name: value for name, value in given.items() if value is not None}
+        asked |= {} if epochs is None else {"epochs": epochs}
+        found.append((label, config, train_config(config.name, **{"keep": "best", **asked})))
     return tuple(found)
 
 

@@ -95,15 +95,13 @@ class Task:
         run, plan, here = self.run, self.plan, self.plan.provenance()
         recorded = _recorded(self.recorded, self.fingerprint, plan)
         (train, validation, test), scaler = _drawn(self)
-        model = make_model(
-            plan.model_config(run.model), train, scaler=scaler, seed=run.seed_weights
-        )
-        training = plan.train_config(run)
+        chosen, training = plan.model_config(run.model), plan.train_config(run)
+        model = make_model(chosen, train, scaler=scaler, seed=run.seed_weights)
         named: dict[str, Any] = {"run_id": run.run_id, **asdict(run)}  # type: ignore[call-overload]
         config = {
             "run": named,
             "plan": plan.settings(),
-            "model": asdict(model.config),
+            "model": asdict(chosen),
             "training": asdict(training),
             "data": self.fingerprint,
             "threads": self.threads,
@@ -117,7 +115,7 @@ class Task:
         except FileFormatError:  # a power cut can leave a checkpoint that is not whole
             shutil.rmtree(out)
             before, started = 0.0, time.time()
-            model = make_model(model.config, train, scaler=scaler, seed=run.seed_weights)
+            model = make_model(chosen, train, scaler=scaler, seed=run.seed_weights)
             fitted = fit(model, train, validation, training, out=out, progress=False)
         evaluation = evaluate({run.model: model}, test, seed=run.seed_draw)
         row: dict[str, Any] = {
