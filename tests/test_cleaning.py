@@ -30,7 +30,7 @@ def built(*signals, **options):
     return assemble([Recording(signals)], ReaderOptions(**options))
 
 
-def report(dataset):
+def log_of(dataset):
     return dataset.meta["cleaning"]
 
 
@@ -72,8 +72,8 @@ class TestOrder:
         dataset = built(signal([0, 20, 10, 30], [0.0, 2.0, 1.0, 3.0]))
         assert dataset[0].times.tolist() == [0.0, 0.01, 0.02, 0.03]
         assert dataset[0].values[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0]
-        assert report(dataset)["order"] == {"option": "sort", "late": 1, "signals": {"x": 1}}
-        assert "1 row came late and was sorted" in sentences(report(dataset))
+        assert log_of(dataset)["order"] == {"option": "sort", "late": 1, "signals": {"x": 1}}
+        assert "1 row came late and was sorted" in sentences(log_of(dataset))
 
     def test_late_rows_can_be_dropped(self):
         dataset = built(signal([0, 20, 10, 30], [0.0, 2.0, 1.0, 3.0]), order="drop")
@@ -97,21 +97,21 @@ class TestDuplicates:
     COLUMNS = ((0.0, 1.0, 3.0, 4.0), (0.0, 7.0, NAN, 4.0))
 
     @pytest.mark.parametrize(
-        ("policy", "merged"), [("last", [3.0, 7.0]), ("first", [1.0, 7.0]), ("mean", [2.0, 7.0])]
+        ("option", "merged"), [("last", [3.0, 7.0]), ("first", [1.0, 7.0]), ("mean", [2.0, 7.0])]
     )
-    def test_of_each_channel_the_known_cells_are_merged(self, policy, merged):
-        dataset = built(signal(self.STAMPS, *self.COLUMNS), duplicates=policy)
+    def test_of_each_channel_the_known_values_are_merged(self, option, merged):
+        dataset = built(signal(self.STAMPS, *self.COLUMNS), duplicates=option)
         assert dataset[0].times.tolist() == [0.0, 0.01, 0.02]
         assert dataset[0].values[1].tolist() == merged
-        assert report(dataset)["duplicates"]["rows"] == 1
+        assert log_of(dataset)["duplicates"]["rows"] == 1
 
-    def test_the_first_known_cell_counts_where_the_first_row_has_none(self):
+    def test_the_first_known_value_counts_where_the_first_row_has_none(self):
         dataset = built(signal([0, 0, 0, 10], [NAN, 5.0, 6.0, 1.0]), duplicates="first")
         assert dataset[0].values[:, 0].tolist() == [5.0, 1.0]
 
-    @pytest.mark.parametrize("policy", ["last", "first", "mean"])
-    def test_what_no_row_knows_stays_unknown(self, policy):
-        dataset = built(signal([0, 10, 10, 20], [1.0, NAN, NAN, 2.0]), duplicates=policy)
+    @pytest.mark.parametrize("option", ["last", "first", "mean"])
+    def test_what_no_row_knows_stays_unknown(self, option):
+        dataset = built(signal([0, 10, 10, 20], [1.0, NAN, NAN, 2.0]), duplicates=option)
         assert same(dataset[0].values[:, 0], [1.0, NAN, 2.0])
 
     def test_they_can_be_refused(self):
@@ -130,20 +130,20 @@ class TestClockJumps:
         first, second = dataset = built(signal(self.BACK, range(200)))
         assert (first.rows, second.rows) == (100, 100)
         assert second.values[0, 0] == 100
-        assert report(dataset)["clock_jumps"] == {"option": "split", "found": 1}
-        assert report(dataset)["order"]["late"] == 0
-        assert report(dataset)["episodes"] == [{"episode": 1, "clock_set_before": 1}]
+        assert log_of(dataset)["clock_jumps"] == {"option": "split", "found": 1}
+        assert log_of(dataset)["order"]["late"] == 0
+        assert log_of(dataset)["episodes"] == [{"episode": 1, "clock_set_before": 1}]
 
     def test_a_clock_set_forth_by_more_than_a_day_begins_a_new_episode(self):
         stamps = [*range(0, 1000, 10), *range(1_700_000_000_000, 1_700_000_001_000, 10)]
         dataset = built(signal(stamps, range(200)), max_gap_s=None)
         assert [t.rows for t in dataset] == [100, 100]
-        assert report(dataset)["clock_jumps"]["found"] == 1
+        assert log_of(dataset)["clock_jumps"]["found"] == 1
 
     def test_it_can_be_ignored_or_refused(self):
         joined = built(signal(self.BACK, range(200)), clock_jumps="join", max_gap_s=None)
         assert joined[0].rows == 200
-        assert report(joined)["order"]["late"] == 100
+        assert log_of(joined)["order"]["late"] == 100
         with pytest.raises(FileFormatError, match=r"set from 0.99 to -60 s at row 100"):
             built(signal(self.BACK, range(200)), clock_jumps="refuse")
 
@@ -151,20 +151,20 @@ class TestClockJumps:
         stamps = list(range(0, 100_000, 10))
         stamps[5000] = 3
         dataset = built(signal(stamps, range(10_000)))
-        assert report(dataset)["clock_jumps"]["found"] == 0
-        assert report(dataset)["order"]["late"] == 1
+        assert log_of(dataset)["clock_jumps"]["found"] == 0
+        assert log_of(dataset)["order"]["late"] == 1
 
     def test_rows_without_any_order_are_none(self):
         stamps = np.random.default_rng(0).permutation(5000) * 1000
         dataset = built(signal(stamps, range(5000)))
-        assert report(dataset)["clock_jumps"]["found"] == 0
+        assert log_of(dataset)["clock_jumps"]["found"] == 0
         assert len(dataset) == 1
 
     def test_all_signals_are_cut_where_the_clock_was_set(self):
         slow = signal(self.BACK[::10], range(20), name="slow")
-        silent = signal([500], [1.0], name="silent", channels=("z",))
-        dataset = built(signal(self.BACK, range(200), name="fast"), slow, silent)
-        assert dataset.names == ("fast.x", "slow.x", "silent.z")
+        pausing = signal([500], [1.0], name="pausing", channels=("z",))
+        dataset = built(signal(self.BACK, range(200), name="fast"), slow, pausing)
+        assert dataset.names == ("fast.x", "slow.x", "pausing.z")
         known = [t.known.sum(axis=0).tolist() for t in dataset]
         assert known == [[100, 10, 1], [100, 10, 0]]
 
@@ -176,9 +176,9 @@ class TestOutages:
         first, second = dataset = built(signal(self.STAMPS, range(200)))
         assert [first.times[0], second.times[0]] == [0.0, 0.0]
         assert dataset.meta["clock_start"] == [0, 13_000 * MS]
-        found = report(dataset)["outages"]
+        found = log_of(dataset)["outages"]
         assert (found["found"], found["longest_s"]) == (1, 12.01)
-        assert "1 outage of 12 s" in " ".join(sentences(report(dataset)))
+        assert "1 outage of 12 s" in " ".join(sentences(log_of(dataset)))
 
     def test_by_default_more_than_20_usual_steps_and_a_second(self):
         steps = np.full(200, 100)
@@ -194,7 +194,7 @@ class TestOutages:
     def test_a_limit_can_be_given(self, limit, episodes):
         assert len(built(signal(self.STAMPS, range(200)), max_gap_s=limit)) == episodes
 
-    def test_a_silence_of_one_sensor_is_none_while_others_speak(self):
+    def test_a_pause_of_one_sensor_is_no_outage_while_others_report(self):
         fast = signal(range(0, 60_000, 10), range(6000), name="fast")
         slow = signal([0, 59_000], [1.0, 2.0], name="slow")
         assert len(built(fast, slow)) == 1
@@ -203,7 +203,7 @@ class TestOutages:
         stamps = [*range(0, 1000, 10), 50_000, *range(100_000, 101_000, 10)]
         dataset = built(signal(stamps, range(201)))
         assert [t.rows for t in dataset] == [100, 100]
-        assert report(dataset)["left_out"] == {
+        assert log_of(dataset)["left_out"] == {
             "min_rows": 2,
             "episodes": 1,
             "rows": 1,
@@ -233,7 +233,7 @@ class TestTheUnion:
         st.lists(st.integers(0, 60), min_size=1, max_size=20, unique=True),
         st.lists(st.integers(0, 60), min_size=1, max_size=20, unique=True),
     )
-    def test_no_cell_is_lost_and_none_is_made_up(self, one, two):
+    def test_no_value_is_lost_and_none_is_made_up(self, one, two):
         one, two = np.sort(one), np.sort(two)
         dataset = built(signal(one, one, name="a"), signal(two, two, name="b"), max_gap_s=None)
         start = min(one[0], two[0])
@@ -257,7 +257,7 @@ class TestTheUnion:
     def test_a_recording_without_a_row_is_left_out(self):
         dataset = assemble([Recording((signal([], []),)), Recording((signal([0], [1.0]),))])
         assert len(dataset) == 1
-        assert report(dataset)["left_out"]["without_rows"] == 1
+        assert log_of(dataset)["left_out"]["without_rows"] == 1
         with pytest.raises(FileFormatError, match="there is no row to read"):
             assemble([Recording((signal([], []),))])
         with pytest.raises(FileFormatError, match="nothing recorded"):
@@ -303,7 +303,7 @@ class TestRepeatedValues:
 
     def test_a_slower_sensor_on_a_faster_grid_is_found(self):
         _, dataset = self.repeated()
-        found = report(dataset)["repeated"]
+        found = log_of(dataset)["repeated"]
         assert found["channels"] == {"x": {"fraction": 150 / 199, "rows_per_value": 4}}
         assert found["masked"] == 0
         assert dataset[0].known.all()
@@ -314,7 +314,7 @@ class TestRepeatedValues:
         assert np.flatnonzero(~np.isnan(column)).tolist() == list(range(0, 200, 4))
         assert column[::4].tolist() == fresh.tolist()
         assert dataset[0].known[:, 1:].all()
-        assert report(dataset)["repeated"]["masked"] == 150
+        assert log_of(dataset)["repeated"]["masked"] == 150
 
     def test_a_sensor_at_rest_is_measured_at_its_own_rate(self):
         values = np.repeat(np.arange(30.0), 4)
@@ -325,7 +325,7 @@ class TestRepeatedValues:
     def test_a_sensor_that_now_and_then_rests_repeats_nothing(self):
         values = np.random.default_rng(0).normal(size=200)
         values[50:190] = 1.0
-        assert report(built(signal(self.STAMPS, values)))["repeated"]["channels"] == {}
+        assert log_of(built(signal(self.STAMPS, values)))["repeated"]["channels"] == {}
 
     def test_repeats_are_found_over_all_episodes_together(self):
         parts = [
@@ -333,7 +333,7 @@ class TestRepeatedValues:
             for i in range(6)
         ]
         dataset = assemble(parts, ReaderOptions(repeated="mask"))
-        assert report(dataset)["repeated"]["channels"]["x"]["rows_per_value"] == 4
+        assert log_of(dataset)["repeated"]["channels"]["x"]["rows_per_value"] == 4
         assert all(t.known.sum() == 3 for t in dataset)
 
     @given(
@@ -366,9 +366,9 @@ class TestAngles:
         wrapped = np.angle(np.exp(1j * angles))
         dataset = built(signal(range(200), wrapped, kinds=("angle",)))
         assert np.allclose(dataset[0].values[:, 0], angles, atol=1e-12)
-        assert report(dataset)["angles"]["turns"] == {"x": 3}
+        assert log_of(dataset)["angles"]["turns"] == {"x": 3}
 
-    def test_degrees_turn_at_360_and_missing_cells_are_stepped_over(self):
+    def test_degrees_turn_at_360_and_missing_values_are_skipped(self):
         dataset = built(
             signal([0, 10, 20, 30], [350.0, NAN, 10.0, 20.0], units=("deg",)), angles=("x",)
         )
@@ -377,6 +377,13 @@ class TestAngles:
     def test_they_can_be_left_as_they_are(self):
         dataset = built(signal([0, 10], [3.0, -3.0], kinds=("angle",)), unwrap=False)
         assert dataset[0].values[:, 0].tolist() == [3.0, -3.0]
+
+    def test_the_array_of_the_reader_becomes_that_of_the_trajectory_where_nothing_is_cleaned(self):
+        logged = signal([0, 10], [1.0, 2.0], [3.0, 4.0])
+        (one,) = built(logged)
+        assert np.shares_memory(one.values, logged.values)
+        with pytest.raises(ValueError, match="read-only"):
+            logged.values[0, 0] = np.inf
 
     def test_the_array_of_the_reader_is_not_written_to(self):
         logged = signal([0, 10], [3.0, -3.0], kinds=("angle",))
@@ -402,7 +409,7 @@ class TestQuaternions:
         flipped = rotation * np.where(np.arange(100) % 7 < 3, -1, 1)[:, None]
         dataset = built(signal(range(100), *flipped.T, **self.KIND))
         assert np.allclose(dataset[0].values, -rotation, atol=1e-15)
-        assert report(dataset)["quaternions"]["flipped"] == int((np.arange(100) % 7 >= 3).sum())
+        assert log_of(dataset)["quaternions"]["flipped"] == int((np.arange(100) % 7 >= 3).sum())
 
     def test_lengths_are_1_and_one_of_length_0_is_missing(self):
         rotation = self.turning(5) * np.array([2.0, 1.0, 0.0, 1.0, 1.0])[:, None]
@@ -410,7 +417,7 @@ class TestQuaternions:
         values = dataset[0].values
         assert np.isnan(values[2]).all()
         assert np.allclose(np.linalg.norm(values[[0, 1, 3, 4]], axis=1), 1, atol=1e-15)
-        found = report(dataset)["quaternions"]
+        found = log_of(dataset)["quaternions"]
         assert (found["renormalised"], found["dropped"]) == (1, 1)
 
     @pytest.mark.parametrize(
@@ -421,7 +428,7 @@ class TestQuaternions:
         rotation = -self.turning()
         channels = tuple(names.split())
         dataset = built(signal(range(100), *rotation.T, channels=channels))
-        assert report(dataset)["quaternions"]["channels"] == [list(channels)]
+        assert log_of(dataset)["quaternions"]["channels"] == [list(channels)]
 
     @pytest.mark.parametrize(
         ("names", "scale"),
@@ -430,7 +437,7 @@ class TestQuaternions:
     def test_others_are_not_taken_for_one(self, names, scale):
         rotation = scale * self.turning()
         dataset = built(signal(range(100), *rotation.T, channels=tuple(names.split())))
-        assert report(dataset)["quaternions"]["channels"] == []
+        assert log_of(dataset)["quaternions"]["channels"] == []
         assert dataset[0].values.tobytes("C") == rotation.tobytes()
 
     def test_they_can_be_kept_as_they_are(self):
@@ -444,7 +451,7 @@ class TestInfiniteValues:
         logged = signal([0, 10], [np.inf, 1.0])
         dataset = built(logged)
         assert same(dataset[0].values[:, 0], [NAN, 1])
-        assert report(dataset)["infinite"]["values"] == 1
+        assert log_of(dataset)["infinite"]["values"] == 1
         assert np.isinf(logged.values[0, 0])
         with pytest.raises(FileFormatError, match="infinite at row 0, channel 'x'"):
             built(logged, infinite="refuse")
@@ -492,9 +499,9 @@ class TestClocks:
         assert "clock_start" not in dataset.meta
 
 
-def test_the_report_is_json_with_every_policy_and_notes_are_said_once():
+def test_the_log_is_json_with_every_option_and_each_note_once():
     parts = [Recording((signal([0], [1.0]),), notes=("said",)) for _ in range(3)]
-    found = report(assemble(parts))
+    found = log_of(assemble(parts))
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["notes"] == ["said"]
     assert sentences(found) == ["said"]

@@ -71,7 +71,7 @@ def test_the_column_of_times_is_found_by_its_name(names, column):
         ("plain", ("plain", "")),
     ],
 )
-def test_a_unit_stands_in_brackets_after_the_name(name, parts):
+def test_a_unit_is_in_brackets_after_the_name(name, parts):
     assert split_unit(name) == parts
 
 
@@ -114,7 +114,7 @@ def test_every_day_from_2000_to_2100_has_one_unit_alone(unit):
         assert find_time_unit([day * ticks, day * ticks + 1])[0] == unit
 
 
-def test_what_is_found_is_said_aloud_and_what_is_stated_is_not():
+def test_what_is_found_is_noted_and_what_is_stated_is_not():
     clock = NOW_S * 10**6 + 4000 * np.arange(9)
     unit, notes = state_time_unit(None, "time", clock, "log.csv")
     assert unit == "us"

@@ -122,7 +122,7 @@ def test_masked_values_stay_known_and_the_seed_alone_decides(mask):
 # --- bursts ---------------------------------------------------------------------------------------
 
 
-def test_a_burst_in_seconds_hides_what_lies_within_that_time():
+def test_a_burst_in_seconds_masks_what_lies_within_that_time():
     random = np.random.default_rng(0)
     times = np.cumsum(random.uniform(0.001, 0.05, 400))
     data = Dataset((Trajectory(times, np.arange(400.0)[:, None]),))

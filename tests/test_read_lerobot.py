@@ -58,7 +58,7 @@ class TestADataSet:
         refused(root, "16 rows x 5 channels, .*; choose episodes= or columns=, or split the file")
         assert len(list(lerobot.recordings(root, episodes=[0]))) == 1
 
-    def test_says_aloud_that_its_stamps_are_made_up(self, write):
+    def test_notes_that_its_stamps_are_made_up(self, write):
         dataset = read(write())
         assert dataset[0].times.tolist() == [0.0, 0.05, 0.1, 0.15]
         notes = dataset.meta["cleaning"]["notes"]

@@ -319,7 +319,7 @@ class TestDamage:
             path.write_bytes(whole[:length])
             refused(path, "can't be read|does not fit|cut short")
 
-    def test_a_bag_whose_recording_was_cut_off_says_how_to_mend_it(self, tmp_path):
+    def test_a_bag_whose_recording_was_cut_off_says_how_to_repair_it(self, tmp_path):
         path = logs.write_bag1(tmp_path / "a.bag", poses(logs.ROS1, 3)[2])
         raw = bytearray(path.read_bytes())
         at = raw.index(b"index_pos=") + 10

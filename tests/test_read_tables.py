@@ -126,7 +126,7 @@ class TestCsvOfOtherPrograms:
         rows = "".join(f"{i},1\n" for i in range(1500)) + "1500.5,1\n"
         assert read(text_file(f"time,x\n{rows}"))[0].times[-1] == 1500.5
 
-    def test_says_the_unit_that_it_found_aloud(self, text_file, caplog):
+    def test_notes_the_unit_that_it_found(self, text_file, caplog):
         rows = "".join(f"{1_714_564_800_000 + 20 * i},1\n" for i in range(5))
         dataset = read(text_file(f"time,x\n{rows}"))
         assert dataset[0].times.tolist() == [0.0, 0.02, 0.04, 0.06, 0.08]

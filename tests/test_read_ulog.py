@@ -123,7 +123,7 @@ def test_the_topics_instances_and_fields_that_there_are_are_listed(write):
     refused(only, r"none of the topics that are read by default.*choose.*from: battery$")
 
 
-def test_logged_dropouts_are_said_aloud(write):
+def test_logged_dropouts_are_noted(write):
     note = one(write(dropouts={2: 30, 5: 112})).notes[0]
     assert note == (
         "the autopilot logged 2 dropouts, 142 ms in all, the longest of 112 ms at 0.004 s"
@@ -150,7 +150,7 @@ def test_a_log_without_any_data_is_refused(write, length):
     refused(path, "can't be read as a ULog|cut off before any data")
 
 
-def test_damage_in_the_middle_is_said_aloud_and_printed_nowhere(write, capsys):
+def test_damage_in_the_middle_is_noted_and_printed_nowhere(write, capsys):
     path = write([gyro(1000 + i) for i in range(200)])
     raw = bytearray(path.read_bytes())
     at = len(raw) // 2

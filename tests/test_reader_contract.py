@@ -210,7 +210,7 @@ def test_a_truncated_file_is_an_error_of_one_line_or_reads_up_to_the_cut(variant
         return
     with contextlib.suppress(FileFormatError):
         rest = read_back(variant, log)
-        assert rest.meta["cleaning"]["notes"] != whole.meta["cleaning"]["notes"]  # it is said aloud
+        assert rest.meta["cleaning"]["notes"] != whole.meta["cleaning"]["notes"]  # it is noted
         assert 0 < rest[0].rows < whole[0].rows
 
 

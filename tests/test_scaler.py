@@ -43,7 +43,7 @@ def test_a_scaler_is_its_formula_over_the_observed_values(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_scaler_does_not_see_hidden_or_unknown_values(kind: str) -> None:
+def test_a_scaler_does_not_see_masked_or_unknown_values(kind: str) -> None:
     data = dataset(5)
     changed = Dataset(
         tuple(

@@ -62,7 +62,7 @@ def test_consecutive_windows_lose_no_row_and_are_half_to_one_and_a_half_long(row
     assert last == rows or length / 2 <= last < 1.5 * length
 
 
-def test_windows_in_seconds_hold_the_rows_within_that_time():
+def test_windows_in_seconds_have_the_rows_within_that_time():
     times = np.array([0.0, 0.1, 0.15, 0.7, 1.0, 1.2, 5.0, 5.9, 6.0, 6.5])
     data = Dataset((Trajectory(times, np.arange(10.0)[:, None]),))
     cut = windows(data, seconds=1.0, cut="consecutive")

@@ -134,14 +134,14 @@ def test_the_columns_can_be_read_by_any_parquet_library(path):
     assert table.column("hip|observed").to_pylist()[:3] == [True, False, True]
 
 
-def test_a_channel_whose_known_cells_are_all_observed_needs_no_column_for_it(tmp_path):
+def test_a_channel_whose_known_values_are_all_observed_needs_no_column_for_it(tmp_path):
     known = Dataset([replace(t, observed=t.known) for t in example()])
     save(known, tmp_path / "known.parquet")
     assert "|observed" not in "".join(pq.read_schema(tmp_path / "known.parquet").names)
     assert_identical(load(tmp_path / "known.parquet"), known)
 
 
-def test_an_empty_cell_of_another_program_is_not_known(path):
+def test_an_empty_value_of_another_program_is_not_known(path):
     def without_foot(table):
         empty = pa.nulls(len(table), pa.float64())
         return table.set_column(table.column_names.index("foot"), "foot", empty)
@@ -186,11 +186,11 @@ def test_meta_that_json_would_change_is_refused(meta, message, tmp_path):
 
 @pytest.mark.parametrize("name", ["time", "trajectory", "knee|observed"])
 def test_a_channel_named_as_another_column_is_refused(name, tmp_path):
-    def hides(t):
+    def renamed(t):
         return replace(t, names=(name, "knee", "foot"), observed=np.zeros_like(t.observed))
 
     with pytest.raises(InputError, match="a channel is called"):
-        save(Dataset([hides(t) for t in example()]), tmp_path / "walk.parquet")
+        save(Dataset([renamed(t) for t in example()]), tmp_path / "walk.parquet")
 
 
 def test_a_data_set_of_offbeat_0_1_0_is_loaded_with_its_actions_as_channels(tmp_path):

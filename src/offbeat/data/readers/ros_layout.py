@@ -46,7 +46,6 @@ _CODES = {
     "float64": "f8",
 }
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-_HEADER = "std_msgs/msg/Header"
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _QUATERNION = "geometry_msgs/msg/Quaternion"
 _NAMES = ("name", "names", "joint_names")
