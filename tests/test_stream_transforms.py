@@ -52,7 +52,7 @@ def as_sent(data: ob.Dataset, *, seed: int = 1) -> ob.Dataset:
 
 def model_of(data: ob.Dataset, name: str = "gru_d", **options: Any) -> ob.Model:
     model = small_model(name, data, scaler="standardise", **options)
-    model.transforms = TRANSFORMS
+    assert model.transforms == TRANSFORMS, "recorded by the data"
     return model
 
 
@@ -112,6 +112,27 @@ def test_signs_of_quaternions_change_nothing() -> None:
     model = model_of(clean)
     one, other = (streamed(ob.Stream(model), as_sent(clean, seed=seed)) for seed in (1, 2))
     np.testing.assert_allclose(one, other, atol=1e-10)
+
+
+def test_a_checkpoint_keeps_the_transforms(tmp_path: Any) -> None:
+    clean = turning()
+    model = model_of(clean)
+    model.save(tmp_path / "model")
+    loaded = ob.load_model(tmp_path / "model")
+    sent = as_sent(clean)
+    np.testing.assert_array_equal(
+        streamed(ob.Stream(loaded), sent), streamed(ob.Stream(model), sent)
+    )
+
+
+def test_a_batch_of_a_wrapped_log_is_that_of_the_unwrapped_one() -> None:
+    clean = turning()
+    model = model_of(clean)
+    one, other = model.batch(as_sent(clean)), model.batch(clean)
+    first = int(clean[0].observed[:, 0].argmax())
+    turns = (clean[0].values[first, 0] - wrap(clean[0].values[first, 0])) / model.scaler.scale[0]
+    shift = np.array([turns, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(one.values[0].numpy() + shift, other.values[0].numpy(), atol=1e-10)
 
 
 def test_a_late_row_at_the_wrap_is_as_good_as_one_in_time() -> None:
@@ -236,7 +257,7 @@ def test_a_pair_fills_a_wrapped_log_as_it_fills_the_unwrapped_one() -> None:
     model = model_of(train)
     config = ob.TrainConfig(epochs=1, batch_size=2, optimizer="adam")
     pair, _, _ = ob.fit_two_sided(model, train, train, config, progress=False)
-    pair.backward.transforms = TRANSFORMS
+    assert pair.backward.transforms == TRANSFORMS
     sent = as_sent(clean)
     wrapped, plain = (ob.impute(pair, data)[0].values for data in (sent, clean))
     hidden = ~sent[0].observed

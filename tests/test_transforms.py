@@ -197,8 +197,8 @@ def test_a_reader_records_its_angles_and_quaternions(tmp_path):
 
 
 def test_a_data_set_of_0_1_names_its_angles():
-    report = {"angles": {"unwrap": True, "turns": {"yaw": 3}}, "quaternions": {"channels": []}}
-    given = dataset([turning()[0]], ("yaw",), meta={"report": report})
+    log = {"angles": {"unwrap": True, "turns": {"yaw": 3}}, "quaternions": {"channels": []}}
+    given = dataset([turning()[0]], ("yaw",), meta={"cleaning": log})
     assert Transforms.of(given) == Transforms({"yaw": Angle(TURN)})
 
 

@@ -117,7 +117,7 @@ class Transforms:
         if META_KEY in dataset.meta:
             found = cls.from_dict(dataset.meta[META_KEY])
         else:
-            log = dataset.meta.get("cleaning", dataset.meta.get("report", {}))
+            log = dataset.meta.get("cleaning", {})
             turns, fours = log.get("angles", {}), log.get("quaternions", {})
             units = dict(zip(dataset.names, dataset.units, strict=True))
             angles = {  # data sets of 0.1.0 name the angles that jumped, without their period
