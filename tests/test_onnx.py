@@ -35,13 +35,13 @@ FIXED = [
     for name, config in VARIANTS.items()
     if not config.self_feeding and config.solver not in ("dopri5", "tsit5")
 ]
+QUICK = ("gru_d", "lstm", "anchored_ode_gru_d", "thesis-ode_gru_d", "gru_d-every")
 EXPORTED = [
-    *sorted(ZOO),
+    *QUICK,
     "ode_gru_d-decay_rk4",
-    "thesis-ode_gru_d",
-    "gru_d-every",
     "ode_rnn-max_step",
-    "anchored_ode_gru_d-decay_max_step",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in sorted(ZOO) if name not in QUICK),
+    pytest.param("anchored_ode_gru_d-decay_max_step", marks=pytest.mark.slow),
 ]
 """The exporter takes seconds, so beside the zoo only what takes another way through the graph."""
 

@@ -17,6 +17,7 @@ from stream_helpers import Recorded, batch_predictions, message
 from test_contract import FLOAT32, TOLERANCE, VARIANTS, build, dtypes, variants
 
 from offbeat import (
+    Dataset,
     DivergenceError,
     InputError,
     Stream,
@@ -170,6 +171,36 @@ def test_a_state_that_left_the_finite_numbers_says_so() -> None:
             stream.predict(0.03 * row + 0.01)
     stream.reset()
     assert np.isfinite(stream.predict(0.0)).all()
+
+
+@pytest.mark.parametrize("name", ["gru_d", "ode_rnn", "anchored_ode_gru_d"])
+def test_an_action_is_predicted_at_the_newest_row_from_what_was_observed_there(name: str) -> None:
+    """And it is an input from the next row on, as in the batch pass."""
+    roles = ("state", "state", "action")
+    data = Dataset(tuple(replace(one, roles=roles) for one in dataset(3, rows=14)))
+    model, one = small_model(name, data), data[1]
+    expected = batch_predictions(model, one)
+    stream, before, after = Stream(model), [], []
+    for row in range(one.rows):
+        said = message(one, row)
+        action = said.pop("channel_2", None)
+        before.append(stream.predict(one.times[row]))
+        stream.observe(one.times[row], said)
+        after.append(stream.predict(one.times[row]))
+        stream.observe(one.times[row], {"channel_2": action})
+    assert relative(np.array(before)[:, :2], expected[:, :2]) < 1e-12
+    assert relative(np.array(after)[:, 2], expected[:, 2]) < 1e-12
+    again = Stream(model)
+    again.restore(json.loads(json.dumps(stream.state())))
+    assert np.array_equal(again.predict(9.0), stream.predict(9.0))
+
+
+@pytest.mark.parametrize(
+    "options", [{"head": "gaussian"}, {"head": "gaussian", "solver": "dopri5"}]
+)
+def test_any_head_is_streamed(options: dict[str, Any]) -> None:
+    model, one = small_model("ode_rnn", **options), trajectory(4, 14)
+    assert relative(streamed(Stream(model), one), batch_predictions(model, one)) < 1e-12
 
 
 # --- its record -----------------------------------------------------------------------------------

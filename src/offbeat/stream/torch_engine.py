@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from offbeat.data.batch import Batch
+from offbeat.data.batch import ACTION, Batch
 from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model
 from offbeat.stream.engine import Arrays, Engine
@@ -69,6 +69,7 @@ class TorchEngine(Engine):
             seen,
             seen,
             self._valid,
+            self._model.roles,
         )
         try:
             with torch.inference_mode():
@@ -87,6 +88,7 @@ class TorchEngine(Engine):
             unseen,
             unseen,
             self._valid.expand(count, 1),
+            self._model.roles,
         )
         expanded = {
             name: part.expand(count, *part.shape[1:]) for name, part in _tensors(self._past).items()
@@ -95,8 +97,13 @@ class TorchEngine(Engine):
         if past.generator is not None:  # it acts after the prediction
             past = replace(past, generator=torch.Generator())
         with torch.inference_mode():
-            predicted: Tensor = self._model(asked.to(self._model.device), past=past).mean
-            return predicted[:, 0].double().cpu().numpy()
+            predicted: Tensor = self._model(asked.to(self._model.device), past=past).mean[:, 0]
+            if self._model.acts:  # an action is read after the observation of its own row
+                now = (torch.tensor(times) == self._past.time.cpu())[:, None]
+                acts = torch.tensor([role == ACTION for role in self._model.roles])
+                acting = self._model.head.decode(self._past.state).mean
+                predicted = torch.where((now & acts).to(predicted.device), acting, predicted)
+            return predicted.double().cpu().numpy()
 
     def save(self, slot: int) -> None:
         """Keeps a reference to the state."""
