@@ -109,7 +109,7 @@ def problem(
     input_decay: bool = False,
     decay: str = "none",
     decay_rows: str = "continuous",
-    ages: int = 0,
+    time_inputs: int = 0,
     activation: str = "tanh",
     units: tuple[int, ...] = (7, 5),
     padded: bool = False,
@@ -119,7 +119,7 @@ def problem(
     """A scan with random weights; about half of the cells are observed, some gaps are 0."""
     generator = torch.Generator().manual_seed(seed)
     driven = hidden + (channels if anchored else 0)
-    features = {"none": 0, "ages": channels, "elapsed": 1}[decay]
+    features = {"none": 0, "delta": channels, "elapsed": 1}[decay]
     if cell == "none" and flow == "none" and not features:
         features = 1  # a scan of nothing at all has no weights
     has_cell = cell != "none"
@@ -131,7 +131,7 @@ def problem(
         gates=gates,
         memory=kind.memory_per_unit * hidden if kind else 0,
         anchored=anchored,
-        time_inputs=ages if has_cell else 0,
+        time_inputs=time_inputs if has_cell else 0,
         field=() if FLOWS[flow] is None else (driven, *units, driven),
         activation=activation,  # type: ignore[arg-type]
         decay=features,
@@ -156,7 +156,7 @@ def problem(
     part: Any = None
     if kind is not None:
         part = kind(
-            2 * channels + ages,
+            2 * channels + time_inputs,
             hidden,
             innovation=channels if anchored else 0,
             reset_after=spec.reset_after,
@@ -185,7 +185,7 @@ def problem(
         update=update,
         values=normal(batch, rows, channels, by=1.0) * mask,
         mask=mask,
-        time_input=uniform(batch, rows, ages) if ages and has_cell else None,
+        time_input=uniform(batch, rows, time_inputs) if time_inputs and has_cell else None,
         updated=torch.cat([torch.zeros(batch, 1, dtype=dtype), update[:, :-1]], dim=1)
         if features
         else None,
@@ -215,7 +215,7 @@ def run(scan: Callable[..., tuple[Tensor, Tensor]], case: Problem) -> dict[str, 
 
 
 def largest_error(got: Tensor, expected: Tensor) -> float:
-    """The largest error, as a share of the largest entry."""
+    """The largest error, as a fraction of the largest entry."""
     if not expected.numel():
         return 0.0
     scale = float(expected.abs().max())

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.skipif(
 def test_every_row_of_a_stream_has_the_bits_of_the_batch(
     variant: str, dtype: torch.dtype, name: str
 ) -> None:
-    """Of a batch with mates and padding; the state is exported, lost and restored on the way."""
+    """In a batch of several lengths; the state is exported, reset and restored on the way."""
     with kernels.use(name):
         model = build(variant, dtype)
         if model.backend()[0] == "reference":

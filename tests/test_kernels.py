@@ -103,9 +103,9 @@ def problems(draw: Any, cell: str, flow: str) -> Problem:
         anchored=anchored,
         self_feeding=not anchored and not plain and draw(st.booleans()),
         input_decay=not anchored and cell != "none" and draw(st.booleans()),
-        decay=draw(st.sampled_from(["none", "ages", "elapsed"])),
+        decay=draw(st.sampled_from(["none", "delta", "elapsed"])),
         decay_rows=draw(st.sampled_from(["continuous", "every_row", "observed_rows"])),
-        ages=draw(st.sampled_from([0, 1, 3])),
+        time_inputs=draw(st.sampled_from([0, 1, 3])),
         activation=draw(st.sampled_from(["tanh", "silu"])),
         padded=draw(st.booleans()),
         dtype=draw(st.sampled_from([torch.float32, torch.float64])),
@@ -114,7 +114,7 @@ def problems(draw: Any, cell: str, flow: str) -> Problem:
 
 LARGE = {
     "ODE-GRU-D of the thesis": {
-        "cell": "gru", "flow": "euler", "decay": "ages", "decay_rows": "every_row",
+        "cell": "gru", "flow": "euler", "decay": "delta", "decay_rows": "every_row",
         "input_decay": True, "units": (100, 100, 100, 100), "batch": 50, "rows": 100,
     },
     "anchored, batch 257 of 100 rows": {
@@ -122,19 +122,20 @@ LARGE = {
         "units": (37, 41), "batch": 257, "rows": 100, "padded": True,
     },
     "GRU-D that feeds itself": {
-        "cell": "gru", "flow": "none", "decay": "ages", "decay_rows": "observed_rows",
+        "cell": "gru", "flow": "none", "decay": "delta", "decay_rows": "observed_rows",
         "input_decay": True, "self_feeding": True, "batch": 129, "rows": 101, "padded": True,
     },
     "LSTM, midpoint steps of bounded length": {
         "cell": "lstm", "flow": "midpoint, longest step", "batch": 33, "rows": 63,
-        "units": (17, 23), "padded": True, "ages": 1,
+        "units": (17, 23), "padded": True, "time_inputs": 1,
     },
     "GRU with the reset after, RK4, decay within the gap": {
-        "cell": "gru, reset after", "flow": "rk4, several steps", "decay": "ages", "batch": 65,
+        "cell": "gru, reset after", "flow": "rk4, several steps", "decay": "delta", "batch": 65,
         "rows": 50, "units": (19,), "padded": True,
     },
     "Elman, Heun, one trajectory": {
-        "cell": "elman", "flow": "heun", "batch": 1, "rows": 399, "units": (29, 13), "ages": 3,
+        "cell": "elman", "flow": "heun", "batch": 1, "rows": 399, "units": (29, 13),
+        "time_inputs": 3,
     },
 }  # fmt: skip
 
@@ -153,7 +154,7 @@ def test_the_compiled_backend_equals_the_reference_at_full_size(
 @pytest.mark.parametrize("cell", [cell for cell in CELLS if cell != "none"])
 def test_gradients_equal_finite_differences(cell: str) -> None:
     case = problem(
-        seed=3, batch=3, rows=4, channels=2, hidden=3, cell=cell, flow="heun", decay="ages",
+        seed=3, batch=3, rows=4, channels=2, hidden=3, cell=cell, flow="heun", decay="delta",
         input_decay=True, units=(4,), padded=True, dtype=torch.float64,
     )  # fmt: skip
     spec, weights, rows, state, _ = case
@@ -198,8 +199,8 @@ def test_a_compiled_perceptron_equals_the_reference(
 
 BITS = {
     "anchored": {"cell": "gru", "flow": "euler", "anchored": True, "activation": "silu"},
-    "lstm": {"cell": "lstm", "flow": "rk4, several steps", "decay": "ages"},
-    "gru_d": {"cell": "gru", "flow": "none", "decay": "ages", "input_decay": True},
+    "lstm": {"cell": "lstm", "flow": "rk4, several steps", "decay": "delta"},
+    "gru_d": {"cell": "gru", "flow": "none", "decay": "delta", "input_decay": True},
     "bounded steps": {"cell": "gru", "flow": "midpoint, longest step", "decay": "elapsed"},
 }
 
@@ -323,7 +324,7 @@ def cut(rows: StepInputs, lanes: slice, at: slice) -> StepInputs:
 @needs_cpu
 def test_padding_receives_no_gradient_and_gives_none() -> None:
     case = problem(seed=9, batch=21, rows=10, channels=3, hidden=5, cell="gru", flow="euler",
-                   decay="ages", padded=True)  # fmt: skip
+                   decay="delta", padded=True)  # fmt: skip
     length = case.rows.length
     assert length is not None
     assert int(length.min()) < 10

@@ -60,7 +60,7 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   T* memory = state + l.c_at * W;
   T* z = c.work;  // as wide as the widest layer
 
-  // The cell's input: observed values, faded values, or the decoded state before the gap.
+  // The cell's input: observed values, decayed values, or the decoded state before the gap.
   T* u = at(l.u);
   T* gate = at(l.gate);
   if (f.active) {
@@ -76,8 +76,8 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
         V a = fma(P::constant(weight, k), load<T>(f.delta + i), P::constant(bias, k));
         a = a < T(0) ? splat(0) : a;
         const V gamma = exp_(-a), mean = P::constant(f.mean, k);
-        const V faded = fma(gamma, load<T>(f.last + i), (1 - gamma) * mean);
-        store<T>(u + i, mask != T(0) ? load<T>(f.values + i) : faded);
+        const V decayed = fma(gamma, load<T>(f.last + i), (1 - gamma) * mean);
+        store<T>(u + i, mask != T(0) ? load<T>(f.values + i) : decayed);
       });
     } else {
       copy<P>(d.C, f.values, u);
