@@ -121,7 +121,7 @@ def test_the_readers_take_the_options_that_their_pages_show(page, monkeypatch):
         suffix = Path(path).suffix or "/"
         known = [reader.options for reader in READERS.values() if suffix in reader.suffixes]
         assert any(set(options) <= set(names) for names in known), (path, options)
-        return ob.Dataset((ob.Trajectory([0.0, 1.0], [[1.0], [2.0]]),), {"report": {}})
+        return ob.Dataset((ob.Trajectory([0.0, 1.0], [[1.0], [2.0]]),), {"cleaning": {}})
 
     monkeypatch.setattr(ob, "read", read, raising=False)
     run_python(page, {"ob": ob, "read_mine": lambda path: ()})

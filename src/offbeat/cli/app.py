@@ -29,17 +29,17 @@ from offbeat.errors import OffbeatError
 
 DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
 
-A first way through, from simulation to a scored model:
+From simulation to a scored model:
 
   offbeat simulate hopper.parquet --n_trajectories 2000
-  offbeat train hopper.parquet runs/ode_rnn --split.window 100 --split.observed_fraction 0.3 \\
-      --model.name ode_rnn --training.epochs 5
-  offbeat evaluate runs/ode_rnn hopper.parquet
-  offbeat predict runs/ode_rnn hopper.parquet predictions.csv
-  offbeat impute runs/ode_rnn hopper.parquet filled.csv
-  offbeat forecast runs/ode_rnn hopper.parquet ahead.csv --horizons '[0.05, 0.1]'
+  offbeat train hopper.parquet runs/hopper --split.window 100 --split.observed_fraction 0.3
+  offbeat evaluate runs/hopper hopper.parquet
+  offbeat predict runs/hopper hopper.parquet predictions.csv
+  offbeat impute runs/hopper hopper.parquet filled.csv
+  offbeat forecast runs/hopper hopper.parquet ahead.csv --horizons 0.05,0.1
 
-Or all of it at once, every model beside the trivial predictor: offbeat demo"""
+A log of your own begins with: offbeat inspect LOG
+Several models at once, compared: offbeat demo"""
 
 
 # The functions are not named after the commands: jsonargparse would find their namesakes in the

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 import typing
-from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -14,8 +13,8 @@ from offbeat.config import TrainConfig
 
 
 def training_options() -> list[Option]:
-    """The fields of `TrainConfig`; what is not given is the recipe's choice."""
-    return _fields(TrainConfig, lambda text: f"{text} By default as the model's recipe.")
+    """The fields of `TrainConfig`; those that are not given are as in the model's recipe."""
+    return _fields(TrainConfig)
 
 
 def reader_options() -> list[Option]:
@@ -45,11 +44,10 @@ def reader_options() -> list[Option]:
     return list(options.values())
 
 
-def _fields(config: type, describe: Callable[[str], str] = str) -> list[Option]:
+def _fields(config: type) -> list[Option]:
     types, helps = typing.get_type_hints(config), _described(config)
     return [
-        Option(field.name, types[field.name], describe(helps.get(field.name, "")))
-        for field in fields(config)
+        Option(field.name, types[field.name], helps.get(field.name, "")) for field in fields(config)
     ]
 
 

@@ -38,7 +38,7 @@ def train_command(
         out: folder of the run: config.yaml, log.csv, checkpoints, model, results.json. A run that
             was stopped continues from its last checkpoint.
         model: what the model consists of; only the name is needed.
-        training: epochs, optimizer and the rest, where they differ from the model's recipe.
+        training: of epochs, optimizer and the rest, those that differ from the model's recipe.
         split: windows, masked values, and the split into training, validation and test part.
         scaler: standardise, min_max, divide_by_max or identity, fitted on the training part.
         two_sided: train a second model on reversed trajectories as well, so that impute can fill
