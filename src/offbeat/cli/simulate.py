@@ -21,7 +21,7 @@ def simulate_command(
 
     Args:
         out: Parquet file to write.
-        robot: hopper or walker.
+        robot: hopper or walker, or an MJCF file.
         n_trajectories: how many, each from its own random state.
         rows: rows per trajectory; one per physics step, 5 ms for the hopper.
         seed: of the initial states; the thesis' protocol uses 123.
