@@ -1,4 +1,4 @@
-"""`OnnxStream`: an exported model, live, on onnxruntime and without torch."""
+"""`OnnxStream`: an exported model that takes messages as they arrive, without torch."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from offbeat.stream.options import StreamOptions, with_options
 FORMAT = "offbeat-step"
 VERSION = 2
 METADATA = "offbeat"
-"""Key in the metadata of the file, where a JSON object stands."""
+"""Key of a JSON object in the metadata of the file."""
 
 STATE = ("state", "time", "start", "observed_at", "channel_at", "last", "updated")
-"""Inputs that hold the state; each comes out again with `_next`."""
+"""Inputs that are the state; each has an output of its name with `_next`."""
 
 _NONE: dict[str, Any] = {"angles": {}, "quaternions": []}  # version 1 had no transforms
 _BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at": -np.inf}
 
 
 class OnnxStream(LiveStream):
-    """A model that `export_onnx` wrote, fed with messages as they come: `Stream` without torch.
+    """A model that `export_onnx` wrote, that takes messages as they arrive: `Stream` without torch.
 
     Args:
         path: the .onnx file.
@@ -62,7 +62,7 @@ class OnnxStream(LiveStream):
 
 
 class OnnxEngine(Engine):
-    """Runs the step of an ONNX file, on one thread; it scales by itself.
+    """Runs the step of an ONNX file, on one thread; the step scales by itself.
 
     Args:
         path: the .onnx file.
@@ -84,11 +84,11 @@ class OnnxEngine(Engine):
         options.log_severity_level = 3
         try:
             session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-            facts = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
-            self.info, self._initial = _read(facts)
+            record = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
+            self.info, self._initial = _read(record)
         except FileFormatError:
             raise
-        except Exception as error:  # onnxruntime has an exception of its own for every fault
+        except Exception as error:  # onnxruntime has an exception for each kind of error
             what = " ".join(f"{type(error).__name__}: {error}".split())
             raise FileFormatError(
                 f"{path} is not a model that offbeat export wrote, or damaged ({what})"
@@ -119,7 +119,7 @@ class OnnxEngine(Engine):
         self._state = dict(zip(STATE, found, strict=True))
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The step with nothing measured, its state thrown away, for each time."""
+        """The step with nothing measured, for each time; its state is not used."""
         feed = {"values": self._unmeasured, **self._state}
         each = [self._session.run(["prediction"], {"t": t[None], **feed})[0] for t in times]
         return np.concatenate(each)
@@ -133,11 +133,11 @@ class OnnxEngine(Engine):
         self._state = self._slots[slot]
 
     def export(self) -> Arrays:
-        """The inputs that hold the state."""
+        """The inputs that are the state."""
         return {name: array.copy() for name, array in self._state.items()}
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes the inputs that hold the state."""
+        """Takes the inputs that are the state."""
         self._state = dict(arrays)
 
     def fingerprint(self) -> str:
@@ -145,17 +145,17 @@ class OnnxEngine(Engine):
         return self._digest
 
 
-def _read(facts: Any) -> tuple[StreamInfo, Arrays]:
+def _read(record: Any) -> tuple[StreamInfo, Arrays]:
     """What the metadata says: the info of the stream, and the state before anything is observed."""
-    if facts["format"] != FORMAT or facts["version"] not in (1, VERSION):
+    if record["format"] != FORMAT or record["version"] not in (1, VERSION):
         raise FileFormatError(
-            f"the ONNX file is a {facts['format']!r} of version {facts['version']!r}, this Offbeat "
-            f"runs {FORMAT!r} of versions 1 to {VERSION}; export the model again"
+            f"the ONNX file is a {record['format']!r} of version {record['version']!r}, this "
+            f"Offbeat runs {FORMAT!r} of versions 1 to {VERSION}; export the model again"
         )
-    names = tuple(facts["names"])
-    dtype = np.dtype(facts["dtype"])
+    names = tuple(record["names"])
+    dtype = np.dtype(record["dtype"])
     initial: Arrays = {
-        name: np.array(values, dtype=dtype) for name, values in facts["initial"].items()
+        name: np.array(values, dtype=dtype) for name, values in record["initial"].items()
     }
     shapes = {"channel_at": (1, len(names))}
     for name, value in _BEGINS.items():
@@ -163,10 +163,10 @@ def _read(facts: Any) -> tuple[StreamInfo, Arrays]:
     initial["updated"] = np.zeros(1, dtype=bool)
     info = StreamInfo(
         names=names,
-        units=tuple(facts["units"]),
+        units=tuple(record["units"]),
         scaler=Scaler.identity(len(names)),
-        median_gap=float(facts["median_gap_s"]),
-        elapsed_limit=float(facts["elapsed_limit_s"]),
-        transforms=Transforms.from_dict(facts["transforms"] if facts["version"] > 1 else _NONE),
+        median_gap=float(record["median_gap_s"]),
+        elapsed_limit=float(record["elapsed_limit_s"]),
+        transforms=Transforms.from_dict(record["transforms"] if record["version"] > 1 else _NONE),
     )
     return info, {name: initial[name] for name in STATE}

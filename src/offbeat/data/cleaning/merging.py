@@ -16,9 +16,8 @@ from offbeat.data.cleaning.log import CleaningLog
 from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.trajectory import Trajectory
+from offbeat.data.transforms import full_turn
 from offbeat.errors import FileFormatError, InputError, one_of
-
-_DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class Channels:
             tuple(roles[at] for at in kept),
             {key: kept[at] for key, at in columns.items() if at in kept},
             {
-                kept[at]: 360.0 if units[at].casefold() in _DEGREES else 2 * np.pi
+                kept[at]: full_turn(units[at])
                 for at, kind in enumerate(kinds)
                 if kind == "angle" and at in kept
             },
