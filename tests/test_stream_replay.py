@@ -54,7 +54,7 @@ def streamed(stream: ob.Stream, one: ob.Trajectory, rows: range) -> Any:
 
 def test_a_stream_of_any_module_predicts_what_its_batch_predicts(model: Any) -> None:
     one = trajectory(4, 14)
-    got = streamed(ob.Stream(model), one, range(14))
+    got = streamed(ob.Stream(model, window_rows=14), one, range(14))
     np.testing.assert_allclose(got, batch_predictions(model, one), rtol=0, atol=1e-12)
 
 
@@ -72,6 +72,17 @@ def test_rows_older_than_the_window_do_not_count(model: Any) -> None:
     expected = batch_predictions(model, longer)[-1]
     np.testing.assert_allclose(stream.predict(asked), expected, rtol=0, atol=1e-12)
     assert np.isfinite(ob.Stream(model, window_rows=1).predict(0.0)).all()
+
+
+def test_the_window_is_that_of_the_training_unless_told_otherwise(model: Any) -> None:
+    longest = max(one.rows for one in dataset(4))
+    stream, told = ob.Stream(model), ob.Stream(model, window_rows=longest)
+    one = trajectory(4, longest + 5)
+    streamed(stream, one, range(one.rows))
+    streamed(told, one, range(one.rows))
+    assert stream.state() == told.state()
+    with pytest.raises(ob.InputError):
+        ob.Stream(model, window_rows=0)
 
 
 def test_several_times_are_independent_and_the_newest_row_is_known_at_its_time(model: Any) -> None:

@@ -22,6 +22,7 @@ class Statistics:
         median_gap: s, between consecutive rows.
         longest_elapsed: s, longest time from a row back to the last observed row.
         longest_delta: s, longest age of any channel (equation 25).
+        rows: of the longest training trajectory; 0 in checkpoints of 0.1.
     """
 
     mean: tuple[float, ...]
@@ -29,6 +30,7 @@ class Statistics:
     median_gap: float
     longest_elapsed: float
     longest_delta: float
+    rows: int = 0
 
     @property
     def channels(self) -> int:
@@ -67,6 +69,7 @@ class Statistics:
             float(gaps.median()),
             max(ages[0], float(gaps.median())),
             max(*ages, float(gaps.median())),
+            batch.rows,
         )
 
     def to_dict(self) -> dict[str, Any]:

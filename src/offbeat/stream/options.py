@@ -50,7 +50,8 @@ class StreamOptions:
         long_gap: after more than `long_gap_s` without a value, `saturate`, let the model's own
             limit act, or `reset`, begin anew.
         long_gap_s: s; None is the model's own limit, where time saturates.
-        window_rows: newest rows that a model without a recurrent state is run on.
+        window_rows: newest rows that a model without a recurrent state is run on; None: as many as
+            the longest trajectory that it was trained on.
 
     Raises:
         InputError: a value is none of these.
@@ -67,7 +68,7 @@ class StreamOptions:
     confirm: int = 5
     long_gap: Literal["saturate", "reset"] = "saturate"
     long_gap_s: float | None = None
-    window_rows: int = 100
+    window_rows: int | None = None
 
     def __post_init__(self) -> None:
         one_of("duplicates", self.duplicates, ("first", "last", "error"))
@@ -76,6 +77,8 @@ class StreamOptions:
         one_of("long_gap", self.long_gap, ("saturate", "reset"))
         for name in ("reorder_rows", "confirm", "window_rows"):
             value = getattr(self, name)
+            if value is None and name == "window_rows":
+                continue
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise InputError(f"{name} must be an integer of at least 1, got {value!r}")
         if not _is_number(self.merge_within_s) or not 0 <= self.merge_within_s < math.inf:

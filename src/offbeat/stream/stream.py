@@ -62,7 +62,8 @@ class Stream(LiveStream):
             elapsed_limit=model.statistics.longest_elapsed * limit,
             transforms=model.transforms,
         )
-        engine = engine_of(model, seed=check_seed(seed), window=chosen.window_rows)
+        window = chosen.window_rows or model.statistics.rows or 1
+        engine = engine_of(model, seed=check_seed(seed), window=window)
         super().__init__(engine, info, options=chosen, time_unit=time_unit)
 
 
