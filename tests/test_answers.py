@@ -24,7 +24,7 @@ from offbeat.answers.fill_rule import (
 )
 from offbeat.answers.scoring import ChannelScores, _targets
 from offbeat.answers.two_sided import _sides_of, fit_rule, reversed_in_time
-from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
+from offbeat.baselines import fill, fillers, forecast, forecasters
 from offbeat.data.masking import masked_values
 
 NAN = float("nan")
@@ -91,7 +91,7 @@ def test_pchip_is_scipys_per_channel_on_the_observed_cells():
         np.testing.assert_allclose(got[inside, channel], curve(one.times[inside]), atol=1e-12)
 
 
-@pytest.mark.parametrize("method", FILLERS)
+@pytest.mark.parametrize("method", fillers())
 def test_a_channel_never_observed_gets_the_training_mean(method):
     (one,) = dataset(1, rows=10)
     blind = with_observed(one, [True, False, True])
@@ -105,7 +105,7 @@ def test_forecasts_by_hand():
     assert forecast(one, at, "constant_velocity", [0.0])[:, 0].tolist() == [9, 12]
     once = one_channel([0.0, 1.0], [9, 5], [0])
     never = one_channel([0.0, 1.0], [9, 5], [])
-    for method in FORECASTERS:
+    for method in forecasters():
         assert forecast(once, at, method, [0.0])[:, 0].tolist() == [9, 9]
         assert forecast(never, at, method, [4.0])[:, 0].tolist() == [4, 4]
 
@@ -434,7 +434,7 @@ def test_imputation_is_scored_by_its_definition_on_the_same_cells_for_all():
     fills = {
         "two_sided": [t.values for t in ob.impute(pair, data)],
         "causal": [t.values for t in ob.impute(pair.forward, data)],
-        **{m: [fill(t, m, mean) for t in data] for m in FILLERS},
+        **{m: [fill(t, m, mean) for t in data] for m in fillers()},
     }
     hidden = [t.known & ~t.observed for t in data]
     assert scores.counts == tuple(sum(h[:, c].sum() for h in hidden) for c in range(3))

@@ -1,94 +1,144 @@
-"""Trivial predictors that stand beside every fill and every forecast; nothing to train."""
+"""Baselines: simple predictors beside every fill and every forecast, with nothing to train."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.trajectory import Trajectory
-from offbeat.errors import one_of
+from offbeat.errors import InputError
+from offbeat.registry import Registry
+
+Array = NDArray[np.float64]
 
 
-def fill(trajectory: Trajectory, method: str, mean: Sequence[float]) -> NDArray[np.float64]:
-    """Fills each channel on its own from its observed cells; hidden values are not looked at.
+@dataclass(frozen=True)
+class Baseline:
+    """A predictor of one channel from its own observations.
+
+    Attributes:
+        predict: (at, times, values, mean) to the values at the times `at`, from observations
+            `values` at `times` (at least one) and the training mean of the channel. A causal
+            baseline uses observations strictly before each of `at`.
+        causal: whether it uses the past alone.
+        fills: whether it is a baseline of fills.
+        forecasts: whether it is a baseline of forecasts; it must be causal.
+    """
+
+    predict: Callable[[Array, Array, Array, float], Array]
+    causal: bool
+    fills: bool = True
+    forecasts: bool = False
+
+    def __post_init__(self) -> None:
+        if self.forecasts and not self.causal:
+            raise InputError("a baseline that forecasts must be causal")
+
+
+BASELINES: Registry[Baseline] = Registry("baseline", group="offbeat.baselines")
+"""Baselines by name."""
+
+
+def fillers() -> tuple[str, ...]:
+    """Names of the baselines of fills."""
+    return tuple(name for name, baseline in BASELINES.items() if baseline.fills)
+
+
+def forecasters() -> tuple[str, ...]:
+    """Names of the baselines of forecasts."""
+    return tuple(name for name, baseline in BASELINES.items() if baseline.forecasts)
+
+
+def fill(trajectory: Trajectory, method: str, mean: Sequence[float]) -> Array:
+    """Fills each channel on its own from its observations; masked values are not used.
 
     - `last_value` repeats the last observed value; before the first, the training mean.
-    - `linear` draws a straight line between neighbours (`numpy.interp`).
-    - `pchip` draws the monotone cubic of Fritsch and Butland (1984) through all of them
+    - `linear` is a straight line between neighbours (`numpy.interp`).
+    - `pchip` is the monotone cubic of Fritsch and Butland (1984) through all of them
       (`scipy.interpolate.PchipInterpolator`).
 
-    The last two look ahead; before the first observation and after the last they hold it. Where a
-    channel is never observed, all give the training mean.
+    The last two use the future; before the first observation and after the last they are constant.
+    Where a channel is never observed, all give the training mean.
 
     Args:
         trajectory: what was observed.
-        method: one of `FILLERS`.
+        method: name of a baseline.
         mean: training mean of each channel, in its unit.
 
     Returns:
-        (rows, channels) in original units; at observed cells, what was observed, but for
-        `last_value`, which is causal: there it is the value before.
+        (rows, channels) in original units. At an observed row, an interpolation gives what was
+        observed, and a causal baseline what it predicts from the observations before.
+
+    Raises:
+        InputError: there is no such baseline.
     """
-    function = _FILLERS[one_of("trivial predictor", method, FILLERS)]
-    filled = np.empty(trajectory.values.shape)
-    for channel, expected in enumerate(mean):
-        seen = np.flatnonzero(trajectory.observed[:, channel])
-        if not len(seen):
-            filled[:, channel] = expected
-            continue
-        times, values = trajectory.times[seen], trajectory.values[seen, channel]
-        filled[:, channel] = function(trajectory.times, times, values, expected)
-    return filled
+    return _predicted(trajectory, trajectory.times, method, mean)
 
 
-def forecast(
-    trajectory: Trajectory, times: NDArray[np.float64], method: str, mean: Sequence[float]
-) -> NDArray[np.float64]:
-    """Goes on after the last observation of each channel.
+def forecast(trajectory: Trajectory, times: Array, method: str, mean: Sequence[float]) -> Array:
+    """Predicts after the last observation of each channel.
 
-    - `last_value` holds it.
-    - `constant_velocity` goes on along the straight line through the last two.
+    - `last_value` repeats it.
+    - `constant_velocity` follows the straight line through the last two; with one, it repeats that.
 
-    Where a channel has been observed once, both hold; where never, both give the training mean.
+    Where a channel is never observed, both give the training mean.
 
     Args:
         trajectory: what was observed.
-        times: (times,) s, not before the last observation.
-        method: one of `FORECASTERS`.
+        times: (times,) s, after the last observation.
+        method: name of a causal baseline.
         mean: training mean of each channel, in its unit.
 
     Returns:
         (times, channels) in original units.
+
+    Raises:
+        InputError: there is no such baseline, or it is not causal.
     """
-    one_of("trivial predictor", method, FORECASTERS)
-    ahead = np.empty((len(times), trajectory.channels))
+    if not BASELINES[method].causal:
+        raise InputError(
+            f"the baseline {method!r} uses the future and cannot forecast; choose one of "
+            f"{', '.join(forecasters())}"
+        )
+    return _predicted(trajectory, times, method, mean)
+
+
+def _predicted(trajectory: Trajectory, at: Array, method: str, mean: Sequence[float]) -> Array:
+    baseline = BASELINES[method]
+    predicted = np.empty((len(at), trajectory.channels))
     for channel, expected in enumerate(mean):
-        seen = np.flatnonzero(trajectory.observed[:, channel])[-2:]
+        seen = np.flatnonzero(trajectory.observed[:, channel])
         if not len(seen):
-            ahead[:, channel] = expected
+            predicted[:, channel] = expected
             continue
-        at, values = trajectory.times[seen], trajectory.values[seen, channel]
-        ahead[:, channel] = values[-1]
-        if method == "constant_velocity" and len(seen) == 2:
-            ahead[:, channel] += (values[1] - values[0]) / (at[1] - at[0]) * (times - at[1])
-    return ahead
+        times, values = trajectory.times[seen], trajectory.values[seen, channel]
+        predicted[:, channel] = baseline.predict(at, times, values, float(expected))
+    return predicted
 
 
-_Array = NDArray[np.float64]
-
-
-def _last_value(at: _Array, times: _Array, values: _Array, mean: float) -> _Array:
+def _last_value(at: Array, times: Array, values: Array, mean: float) -> Array:
     before = np.searchsorted(times, at) - 1
     return np.where(before >= 0, values[np.maximum(before, 0)], mean)
 
 
-def _linear(at: _Array, times: _Array, values: _Array, mean: float) -> _Array:
+def _constant_velocity(at: Array, times: Array, values: Array, mean: float) -> Array:
+    last = _last_value(at, times, values, mean)
+    if len(times) < 2:
+        return last
+    before = np.searchsorted(times, at) - 1
+    end = np.maximum(before, 1)
+    slope = (values[end] - values[end - 1]) / (times[end] - times[end - 1])
+    return np.where(before >= 1, last + slope * (at - times[end]), last)
+
+
+def _linear(at: Array, times: Array, values: Array, mean: float) -> Array:
     return np.interp(at, times, values)
 
 
-def _pchip(at: _Array, times: _Array, values: _Array, mean: float) -> _Array:
+def _pchip(at: Array, times: Array, values: Array, mean: float) -> Array:
     from scipy.interpolate import PchipInterpolator
 
     if len(times) < 2:
@@ -97,14 +147,9 @@ def _pchip(at: _Array, times: _Array, values: _Array, mean: float) -> _Array:
     return np.asarray(curve(np.clip(at, times[0], times[-1]) - times[0]), dtype=np.float64)
 
 
-_FILLERS: dict[str, Callable[[_Array, _Array, _Array, float], _Array]] = {
-    "last_value": _last_value,
-    "linear": _linear,
-    "pchip": _pchip,
-}
-
-FILLERS = tuple(_FILLERS)
-"""What stands beside every imputation."""
-
-FORECASTERS = ("last_value", "constant_velocity")
-"""What stands beside every extrapolation."""
+BASELINES.register("last_value", Baseline(_last_value, causal=True, forecasts=True))
+BASELINES.register(
+    "constant_velocity", Baseline(_constant_velocity, causal=True, fills=False, forecasts=True)
+)
+BASELINES.register("linear", Baseline(_linear, causal=False))
+BASELINES.register("pchip", Baseline(_pchip, causal=False))

@@ -15,7 +15,7 @@ from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
 from offbeat.answers.predict import in_model_order, predict
 from offbeat.answers.two_sided import TwoSided
-from offbeat.baselines import FILLERS, FORECASTERS, fill, forecast
+from offbeat.baselines import fill, fillers, forecast, forecasters
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
@@ -223,7 +223,7 @@ def fills_of(
     if isinstance(model, TwoSided):
         result["two_sided"] = [t.values for t in impute(model, dataset, seed=seed)]
     mean = training_mean(forward)
-    for method in FILLERS:
+    for method in fillers():
         result[method] = [fill(t, method, mean) for t in dataset]
     return result
 
@@ -264,9 +264,9 @@ def score_imputation(
             chosen = counted & (length > 0) & (group == k)
             grouped.setdefault(k, _sums_for(forward)).add(trajectory.values, each, chosen)
     inside = tuple(
-        (unit * 2.0**k, grouped[k].scores("imputation", FILLERS)) for k in sorted(grouped)
+        (unit * 2.0**k, grouped[k].scores("imputation", fillers())) for k in sorted(grouped)
     )
-    return ImputationScores(sums.scores("imputation", FILLERS), inside)
+    return ImputationScores(sums.scores("imputation", fillers()), inside)
 
 
 def score_forecast(
@@ -306,10 +306,10 @@ def score_forecast(
             predicted = predict(model, pasts, times=asked)
             for (past, at, truth, counted), answer in zip(tasks, predicted, strict=True):
                 each = {model.name: answer.values}
-                for method in FORECASTERS:
+                for method in forecasters():
                     each[method] = forecast(past, np.array([at]), method, mean)
                 sums.add(truth, each, counted)
-        results.append(sums.scores(name, FORECASTERS))
+        results.append(sums.scores(name, forecasters()))
     if not any(sum(scores.counts) for scores in results):
         raise InputError(
             f"no trajectory is long enough for a horizon of {after[0]:g} s after an observation; "

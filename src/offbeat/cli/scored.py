@@ -121,7 +121,7 @@ def forecast_figure(
     mean = training_mean(model)
     drawn = {
         method: replace(ahead, values=baselines.forecast(truth, ahead.times, method, mean))
-        for method in baselines.FORECASTERS
+        for method in baselines.forecasters()
     }
     drawn[model.name] = ahead
     start = int(np.searchsorted(truth.times, truth.times[-1] - 4 * horizons[-1]))
