@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -202,6 +204,16 @@ def test_a_model_of_ones_own_is_fitted_scored_saved_and_streamed(entries, tmp_pa
     MODELS.unregister("last_and_slope")
     with pytest.raises(ob.InputError, match="register_model"):
         ob.load_model(tmp_path / "model")
+
+
+def test_the_example_of_the_architecture_page_runs(entries, capsys):
+    page = (Path(__file__).parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    assert len(block.splitlines()) <= 40
+    scope: dict[str, object] = {}
+    exec(compile(block, "docs/architecture.md", "exec"), scope)
+    assert "last_and_slope" in capsys.readouterr().out
+    assert scope["ahead"][0].values.shape == (1, 1)
 
 
 def test_the_same_seed_makes_the_same_model_of_ones_own(entries):

@@ -899,7 +899,7 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
         ({"decoder_units": (5, 0)}, "decoder_units must be a list of layer sizes"),
         ({"field_units": 7}, "field_units must be a list of layer sizes"),
         ({"cell": "grru"}, "unknown cell 'grru'.*did you mean 'gru'"),
-        ({"solver": "rk45"}, "unknown model option solver.*dopri5"),
+        ({"solver": "rk45"}, "unknown solver.*dopri5"),
         ({"activation": "relu"}, "expected one of: silu, tanh"),
         ({"decay": "yes"}, "unknown model option decay 'yes'"),
         ({"decay_rows": "all"}, "unknown model option decay_rows"),

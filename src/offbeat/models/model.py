@@ -28,6 +28,7 @@ from offbeat.kernels import (
 )
 from offbeat.models.base import BaseModel, DataInfo
 from offbeat.models.elapsed import ElapsedTimes, RecurrentState, elapsed_times
+from offbeat.ode import tableau
 from offbeat.parts import CELLS, FIELDS, HEADS, Cell, HeadShape, Perceptron, Prediction
 from offbeat.parts.decay import ExponentialDecay, InputDecay, TrainableDecay
 
@@ -354,6 +355,7 @@ def _spec(
     if decay_rows == "every_row" and not isinstance(decay, TrainableDecay):
         decay_rows = "continuous"  # of elapsed time the two are the same
     kind = config.vector_field or "none"
+    tableau(config.solver or "euler")  # an unknown one is refused here
     units = tuple(config.field_units or ()) if kind == "mlp" else ()
     return ScanSpec(
         channels=channels,

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from offbeat.errors import InputError, one_of
+from offbeat.errors import InputError
+from offbeat.registry import Registry
 
 _TOLERANCE = 1e-12
 
@@ -189,10 +190,11 @@ _TSIT5 = Tableau(
     first_same_as_last=True,
 )
 
-TABLEAUS: dict[str, Tableau] = {
-    method.name: method for method in (_EULER, _MIDPOINT, _HEUN, _RK4, _DOPRI5, _TSIT5)
-}
-"""Every method by its name; a new one is one more entry."""
+TABLEAUS: Registry[Tableau] = Registry("solver", group="offbeat.solvers")
+"""Every method by the name that `ModelConfig.solver` takes."""
+
+for _method in (_EULER, _MIDPOINT, _HEUN, _RK4, _DOPRI5, _TSIT5):
+    TABLEAUS.register(_method.name, _method)
 
 
 def tableau(name: str) -> Tableau:
@@ -201,4 +203,4 @@ def tableau(name: str) -> Tableau:
     Raises:
         InputError: there is none; the message lists the names.
     """
-    return TABLEAUS[one_of("solver", name, TABLEAUS)]
+    return TABLEAUS[name]
