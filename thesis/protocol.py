@@ -250,7 +250,7 @@ class Protocol:
                 name=label,
                 hidden_size=self.anchored_hidden_size,
                 field_units=self.anchored_field_units,
-                solver=self.solver,  # type: ignore[arg-type]  # checked by ModelConfig
+                solver=self.solver,
                 steps_per_gap=self.steps_per_gap,
                 typical_gap=self.anchored_typical_gap,
             )
