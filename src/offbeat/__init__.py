@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from offbeat.sweeps.sweep import sweep
     from offbeat.training import FitResult, fit
 
-__version__ = "0.2.0.dev0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "BaseModel": "models.base",
