@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from packaging.requirements import Requirement
 
@@ -21,6 +22,7 @@ from offbeat.cli.app import COMMANDS, main, run_commands
 from offbeat.cli.option_groups import reader_options, training_options
 from offbeat.cli.parser import CommandParser
 from offbeat.cli.train import train_command
+from offbeat.models.zoo import MODELS
 
 SMALL = [
     "--model.name=gru", "--model.hidden_size=4", "--training.epochs=1", "--training.batch_size=8",
@@ -521,6 +523,35 @@ def test_a_training_without_options_follows_the_recipe_and_beats_the_last_value(
     recipe = ob.train_config("anchored_ode_gru_d", keep="best")
     assert ob.TrainConfig(**config) == recipe
     assert config["optimizer"] == "adam"
+
+
+class Mean(torch.nn.Module):
+    """Predicts a learned mean of each channel: a model that is none of the library's."""
+
+    def __init__(self, data: ob.DataInfo) -> None:
+        super().__init__()
+        self.mean = torch.nn.Parameter(torch.zeros(len(data.names)))
+
+    def forward(self, batch: ob.Batch) -> ob.Prediction:
+        return ob.Prediction(self.mean.expand_as(batch.values))
+
+
+def test_a_model_of_ones_own_goes_through_every_command(data, tmp_path, capsys):
+    ob.register_model("mean", Mean)
+    run, out = tmp_path / "run", tmp_path / "out.csv"
+    train = ["train", str(data), str(run), "--model.name=mean", "--training.epochs=1"]
+    try:
+        assert "--model.hidden_size" in one_line_error(capsys, *train, "--model.hidden_size=3")
+        assert "'gpu'" in one_line_error(capsys, *train, "--device=gpu")
+        assert not run.exists()
+        assert main([*train, "--device=cpu"]) == 0
+        assert yaml.safe_load((run / "config.yaml").read_text())["model"] == {"name": "mean"}
+        for command in (["evaluate"], ["predict", out], ["impute", out]):
+            assert main([command[0], str(run), str(data), *map(str, command[1:])]) == 0
+        assert main(["forecast", str(run), str(data), str(out), "--horizons=0.1"]) == 0
+        assert "'mean'" in one_line_error(capsys, "export", run, tmp_path / "a.onnx")
+    finally:
+        MODELS.unregister("mean")
 
 
 def test_options_of_the_training_replace_those_of_the_recipe(data, tmp_path):

@@ -105,6 +105,7 @@ def fit_two_sided(
     *,
     out: str | Path | None = None,
     seed: int = 0,
+    device: str | None = None,
     progress: bool = True,
 ) -> tuple[TwoSided, FitResult, FitResult]:
     """Trains a model, a second one on reversed trajectories, and the rule that combines them.
@@ -117,6 +118,7 @@ def fit_two_sided(
         out: folder of the run; the backward model's is `backward` inside it. A run that was stopped
             is resumed.
         seed: of the initial weights of the backward model.
+        device: as of `fit`, for both models.
         progress: show progress bars.
 
     Returns:
@@ -129,7 +131,7 @@ def fit_two_sided(
     folder = Path(out) if out is not None else None
     # What is reversed must be continuous already: a wrap is found from the past alone.
     train, validation = (model.transforms.apply(part) for part in (train, validation))
-    ahead = fit(model, train, validation, config, out=folder, progress=progress)
+    ahead = fit(model, train, validation, config, out=folder, device=device, progress=progress)
     kind, options = (
         (model.config, {})
         if isinstance(model, Model)
@@ -143,6 +145,7 @@ def fit_two_sided(
         reversed_in_time(validation),
         config,
         out=folder / "backward" if folder is not None else None,
+        device=device,
         progress=progress,
     )
     pair = TwoSided(model, back, fit_rule(model, back, validation, seed=seed))

@@ -30,5 +30,5 @@ def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False)
     loaded = load_model(model)
     export_onnx(loaded, out)
     size = out.stat().st_size
-    result = {"written": str(out), "model": loaded.config.name, "bytes": size}
-    say(result, f"{out}: one step of {loaded.config.name}, {size} bytes", json)
+    result = {"written": str(out), "model": loaded.name, "bytes": size}
+    say(result, f"{out}: one step of {loaded.name}, {size} bytes", json)

@@ -26,6 +26,7 @@ def train_command(
     reader: dict[str, Any] | None = None,
     seed: int = 0,
     threads: int = 1,
+    device: str = "cpu",
     json: bool = False,
 ) -> None:
     """Train a model on a data set, and score it on the test part.
@@ -46,6 +47,7 @@ def train_command(
         reader: how the log is read; the run keeps these options for the other commands.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
+        device: that the model is trained on: cpu, cuda or cuda:1.
         json: print the scores as JSON.
     """
     import torch
@@ -58,6 +60,7 @@ def train_command(
     from offbeat.data.splits import apply_split, save_split
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
+    from offbeat.models.base import BaseModel
     from offbeat.models.model import Model
     from offbeat.models.zoo import make_model, train_config
     from offbeat.training import fit
@@ -79,10 +82,17 @@ def train_command(
             file=sys.stderr,
         )
     made = make_model(model, train_part, scaler=scaler, seed=seed)  # type: ignore[arg-type]
+    composed = isinstance(made, Model)
+    given = [name for name, value in asdict(model).items() if value is not None and name != "name"]
+    if given and not composed:
+        raise InputError(
+            f"--model.{given[0]} is an option of the models that come with Offbeat; {model.name} "
+            "is a module with options of its own: register it under another name with those"
+        )
     resolved = {
         "data": str(data),
         "out": str(out),
-        "model": plain(asdict(made.config)),
+        "model": plain(asdict(made.config)) if composed else {"name": made.name},
         "training": plain(asdict(config)),
         "split": plain(asdict(split)),
         "scaler": scaler,
@@ -90,12 +100,15 @@ def train_command(
         "reader": reader,
         "seed": seed,
         "threads": threads,
+        "device": device,
     }
-    trained: Model | TwoSided = made
+    trained: BaseModel | TwoSided = made
     if two_sided:
-        trained, fitted, _ = fit_two_sided(made, train_part, validation, config, out=out, seed=seed)
+        trained, fitted, _ = fit_two_sided(
+            made, train_part, validation, config, out=out, seed=seed, device=device
+        )
     else:
-        fitted = fit(made, train_part, validation, config, out=out)
+        fitted = fit(made, train_part, validation, config, out=out, device=device)
     write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
     save_split(out / "split.json", split, dataset)
     if reader:
