@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 from offbeat.cli.common import say
 
@@ -19,13 +18,13 @@ def run_command(
     processes: int | None = None,
     threads: int = 1,
     budget_minutes: float | None = None,
-    engine_options: dict[str, Any] | None = None,
+    engine_options: dict[str, str | int | float | bool | None] | None = None,
     publish: Path | None = None,
     json: bool = False,
 ) -> None:
     """Repeat the thesis: 376 runs, 176 as the thesis made them and 200 that show what they mean.
 
-    Killed at any moment, the same command goes on where it was and ends with the same numbers.
+    Killed at any moment, the same command continues and ends with the same numbers.
 
     Args:
         out: folder for data, runs and the record: record.parquet, record.csv, curves.parquet,
@@ -37,10 +36,10 @@ def run_command(
             experiment, model, fraction and repeat.
         record: folder of another record; runs in it are not done again.
         mixed: where the record holds runs of other code, of another processor, scan backend, torch
-            or data: refuse to go on, accept them (the record marks them), or redo them.
+            or data: refuse to continue, accept them (the record marks them), or redo them.
         processes: runs at a time; by default what there is room for.
         threads: of each run.
-        budget_minutes: stop after so long; the same command goes on later.
+        budget_minutes: stop after so long; the same command continues later.
         engine_options: as JSON; for ray, arguments of ray.init, for slurm of submitit's
             update_parameters.
         publish: folder to copy the record to when this call ends, for a commit: record, curves,

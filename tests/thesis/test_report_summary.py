@@ -110,27 +110,6 @@ def test_the_spread_that_the_constant_makes_is_held_against_the_inference(conten
         assert re.findall(r"\d+", told[1].split(".")[0]) == more
 
 
-def test_few_repeats_are_called_few(text):
-    assert "a verdict can still change" not in text
-    few = summary(contents_of(made.synthetic(repeats=4, epochs=60), repeats=10))
-    assert "So far a model has 4 of 10 repeats at a fraction" in few
-
-
-def test_what_is_inferred_is_called_so_and_commands_are_there(text):
-    inferred = text.split("## What is inferred about the thesis")[1].split("\n## ")[0]
-    assert "self_feeding=0.5" in inferred
-    assert "not public" in inferred
-    for command in (
-        "python -m thesis run --out runs/thesis",
-        "python -m thesis report runs/thesis --out",
-    ):
-        assert command in text
-    assert (
-        len(re.findall(r"^\*`python -m thesis report", text, flags=re.M)) >= 7
-    )  # one under each section
-    assert "/work" not in text
-
-
 @pytest.mark.parametrize(
     ("source", "said"),
     [

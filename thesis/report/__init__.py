@@ -1,1 +1,1 @@
-"""Figures and animations: they render records and plain arrays, and compute nothing."""
+"""The report of the thesis' runs: tests and findings, tables, figures, the page."""
