@@ -148,7 +148,7 @@ def _condition_names(raws: Sequence[RawRun]) -> dict[Any, str]:
         parts = [str(raw.condition["data"])] if "data" in raw.shown else []
         shown = [key for key in raw.condition if key in raw.shown or key in differ]
         parts += [
-            f"{key} {raw.condition[key]}"
+            str(raw.condition[key]) if key == "condition" else f"{key} {raw.condition[key]}"
             for key in shown
             if raw.condition[key] is not None and not (key == "data" and "data" in raw.shown)
         ]
