@@ -129,12 +129,12 @@ def test_the_rule_contains_linear_interpolation_and_pchip_and_the_last_values():
     (one,) = dataset(1, rows=30)
     random = np.random.default_rng(0)
     f, b = random.normal(size=(2, 30, 3))
-    hidden = ~one.observed
-    held = [1.0, 0, 0, 0, 0]
+    masked = ~one.observed
+    observed = [1.0, 0, 0, 0, 0]
     for last, method in (([0, 0, 0, 1.0, 0], "linear"), ([0, 0, 0, 0, 1.0], "pchip")):
-        got = fill_with([last, held, held], one, f, b)
+        got = fill_with([last, observed, observed], one, f, b)
         expected = fill(one, method, [0.0] * 3)
-        np.testing.assert_allclose(got[hidden], expected[hidden], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(got[masked], expected[masked], rtol=0, atol=1e-12)
     # Two predictors that hold what they saw cross-fade along the straight line.
     first = one_channel([0.0, 0.2, 1.0], [3, NAN, 5], [0, 2])
     faded = fill_with(np.zeros((3, 5)), first, [[3], [3], [3]], [[5], [5], [5]])
@@ -164,7 +164,7 @@ def test_weights_are_the_least_squares_solution_with_the_ridge_as_extra_rows(see
     np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_many_cells_of_a_known_rule_give_its_weights_back_per_channel_and_group():
+def test_many_values_of_a_known_rule_give_its_weights_back_per_channel_and_group():
     random = np.random.default_rng(1)
     true = random.uniform(-1, 1, (2, 4, 5))  # channels, groups 0 to 3
     equations = NormalEquations(2, 0.1)
@@ -180,7 +180,7 @@ def test_many_cells_of_a_known_rule_give_its_weights_back_per_channel_and_group(
     assert rule.counts[0, :4].sum() == 5 * 2 * rows
     assert rule.counts[1:].sum() == 0
     assert np.array_equal(rule.weights[0, 1, 0], START[1]), "unseen sides keep the start"
-    assert [names[0] for names in rule.chosen] == ["ridge 3"] * 2, "held as little as can be"
+    assert [names[0] for names in rule.chosen] == ["ridge 3"] * 2, "shrunk as little as can be"
 
 
 @pytest.mark.parametrize(("weight", "name"), [(3, "line"), (4, "pchip")])
@@ -235,7 +235,7 @@ def test_a_rule_survives_json_to_the_last_bit():
 
 @pytest.mark.parametrize("name", ["anchored_ode_gru_d", "gru_d", "gru"])
 @pytest.mark.parametrize("mode", ["causal", "two_sided"])
-def test_a_fill_never_sees_the_cell_itself_or_another_hidden_one(name, mode):
+def test_a_fill_never_uses_the_value_itself_or_another_masked_one(name, mode):
     data = dataset(3, rows=20)
     pair = pair_of(data, name)
     random = np.random.default_rng(5)
@@ -372,7 +372,7 @@ def test_a_damaged_rule_is_named(tmp_path, text):
         ob.load_two_sided(tmp_path)
 
 
-def test_a_rule_can_be_chosen_where_nothing_was_hidden():
+def test_a_rule_can_be_chosen_where_nothing_was_masked():
     data = ob.Dataset(tuple(ob.Trajectory(t.times, t.values) for t in dataset(4, rows=20)))
     forward, backward = small_model("gru", data), small_model("gru", reversed_in_time(data))
     rule = fit_rule(forward, backward, data)
@@ -436,12 +436,12 @@ def test_imputation_is_scored_by_its_definition_on_the_same_cells_for_all():
         "causal": [t.values for t in ob.impute(pair.forward, data)],
         **{m: [fill(t, m, mean) for t in data] for m in fillers()},
     }
-    hidden = [t.known & ~t.observed for t in data]
-    assert scores.counts == tuple(sum(h[:, c].sum() for h in hidden) for c in range(3))
+    masked = [t.known & ~t.observed for t in data]
+    assert scores.counts == tuple(sum(h[:, c].sum() for h in masked) for c in range(3))
     scale = np.abs(pair.forward.scaler.scale) * np.array(pair.forward.statistics.std)
     for name, values in fills.items():
         errors = [
-            [(v[h[:, c], c] - t.values[h[:, c], c]) for t, v, h in zip(data, values, hidden,
+            [(v[h[:, c], c] - t.values[h[:, c], c]) for t, v, h in zip(data, values, masked,
              strict=True)] for c in range(3)
         ]  # fmt: skip
         each = [float(np.sqrt(np.mean(np.concatenate(e) ** 2))) for e in errors]
@@ -513,7 +513,7 @@ def test_targets_are_spread_over_the_trajectory_and_no_more_than_asked_for():
         ob.score_forecast(small_model("gru", dataset(2)), dataset(2), [1e6])
 
 
-def test_nothing_hidden_cannot_be_scored():
+def test_nothing_masked_cannot_be_scored():
     data = ob.Dataset(tuple(ob.Trajectory(t.times, t.values) for t in dataset(2)))
     data = ob.Dataset(tuple(replace(t, units=("m",) * 3) for t in data))
     with pytest.raises(ob.InputError):

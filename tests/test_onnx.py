@@ -68,7 +68,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def difference(got: Any, expected: Any) -> float:
-    """Largest error as a share of the largest entry."""
+    """Largest error relative to the largest entry."""
     assert np.shape(got) == np.shape(expected)
     assert np.isfinite(expected).all()
     return float(np.abs(np.subtract(got, expected)).max() / np.abs(expected).max())
@@ -85,8 +85,8 @@ def test_the_traced_step_predicts_what_a_stream_predicts(variant: str, dtype: to
     times = one.times.copy()
     times[9:] += 0.3  # longer than the limit of the model's clock
     assert 4 * model.statistics.longest_elapsed < 0.3 or "max_step" in variant
-    step, carry = StreamStep(model), model.empty_state(1)
-    state: tuple[Tensor, ...] = tuple(getattr(carry, name) for name in STATE)
+    step, past = StreamStep(model), model.empty_state(1)
+    state: tuple[Tensor, ...] = tuple(getattr(past, name) for name in STATE)
     stream, got, expected = Stream(model), [], []
     for row in range(one.rows):
         values = np.where(one.observed[row], one.values[row], np.nan)
@@ -97,7 +97,7 @@ def test_the_traced_step_predicts_what_a_stream_predicts(variant: str, dtype: to
         expected.append(stream.predict(times[row]))
         stream.observe(times[row], message(one, row))
         state = tuple(after)
-    assert [part.dtype for part in state] == [getattr(carry, name).dtype for name in STATE]
+    assert [part.dtype for part in state] == [getattr(past, name).dtype for name in STATE]
     assert difference(got, expected) < TOLERANCE[dtype]
 
 

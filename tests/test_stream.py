@@ -33,7 +33,7 @@ some = pytest.mark.parametrize(
 
 
 def relative(got: Any, expected: Any) -> float:
-    """Largest error as a share of the largest entry."""
+    """Largest error relative to the largest entry."""
     got, expected = np.asarray(got), np.asarray(expected)
     assert got.shape == expected.shape
     assert np.isfinite(expected).all()

@@ -328,11 +328,11 @@ def test_a_jump_may_be_ruled_out_or_be_an_error() -> None:
 
 
 @pytest.mark.parametrize(("limit", "longest"), [(None, 2.0), (0.5, 0.5)])
-@pytest.mark.parametrize("policy", ["saturate", "reset"])
+@pytest.mark.parametrize("option", ["saturate", "reset"])
 def test_long_gaps_are_counted_and_may_begin_anew(
-    policy: str, limit: float | None, longest: float
+    option: str, limit: float | None, longest: float
 ) -> None:
-    stream = Recorded(long_gap=policy, long_gap_s=limit)
+    stream = Recorded(long_gap=option, long_gap_s=limit)
     usual = 0.99 * longest
     said(stream, (0.0, {"a": 1.0}), (usual, {"a": 2.0}), (2 * usual, {}))
     assert stream.counters.long_gaps == 0
@@ -340,8 +340,8 @@ def test_long_gaps_are_counted_and_may_begin_anew(
     assert stream.counters.long_gaps == 1
     assert stream.counters.longest_gap_s == pytest.approx(1.01 * longest)
     kept = [values[0] for _, values in stream.rows]
-    assert kept == ([3.0] if policy == "reset" else [1.0, 2.0, None, 3.0])
-    assert stream.counters.resets == (policy == "reset")
+    assert kept == ([3.0] if option == "reset" else [1.0, 2.0, None, 3.0])
+    assert stream.counters.resets == (option == "reset")
 
 
 def test_after_a_gap_that_began_anew_older_messages_do_not_come_back() -> None:

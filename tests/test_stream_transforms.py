@@ -227,14 +227,14 @@ def test_forecasts_and_fills_come_back_in_what_was_given() -> None:
     wrapped, plain = (ob.forecast(model, data, horizons)[0].values for data in (sent, clean))
     same_pose(wrapped, plain, atol=1e-10)
     assert np.abs(wrapped[:, 0]).max() <= math.pi < plain[:, 0].min()
-    hidden = ~sent[0].observed
+    masked = ~sent[0].observed
     filled = ob.impute(model, sent)[0].values
-    assert np.array_equal(filled[~hidden], sent[0].values[~hidden])
+    assert np.array_equal(filled[~masked], sent[0].values[~masked])
     assert np.abs(filled[:, 0]).max() <= math.pi
-    expected = np.where(hidden, ob.predict(model, sent)[0].values, filled)
+    expected = np.where(masked, ob.predict(model, sent)[0].values, filled)
     np.testing.assert_array_equal(filled, expected)
     same_pose(
-        np.where(hidden, filled, 0), np.where(hidden, ob.impute(model, clean)[0].values, 0),
+        np.where(masked, filled, 0), np.where(masked, ob.impute(model, clean)[0].values, 0),
         atol=1e-10,
     )  # fmt: skip
 
@@ -260,6 +260,6 @@ def test_a_pair_fills_a_wrapped_log_as_it_fills_the_unwrapped_one() -> None:
     assert pair.backward.transforms == TRANSFORMS
     sent = as_sent(clean)
     wrapped, plain = (ob.impute(pair, data)[0].values for data in (sent, clean))
-    hidden = ~sent[0].observed
-    same_pose(np.where(hidden, wrapped, 0), np.where(hidden, plain, 0), atol=1e-9)
+    masked = ~sent[0].observed
+    same_pose(np.where(masked, wrapped, 0), np.where(masked, plain, 0), atol=1e-9)
     assert np.abs(wrapped[:, 0]).max() <= math.pi

@@ -13,7 +13,7 @@ Outcome = Literal[
 ]
 """What was done with a message.
 
-`new`: a row of its own. `merged`: joined the row of the same time. `duplicate`: held nothing new.
+`new`: a row of its own. `merged`: joined the row of the same time. `duplicate`: had nothing new.
 `reordered`: came late and was put in its place. `late`, `stale`, `ahead`: dropped. `pending`: waits
 until it is clear whether the clock has jumped. `jumped`: the clock has.
 """
