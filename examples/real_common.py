@@ -79,7 +79,7 @@ def data_folder() -> Path:
 
 
 def silenced(log: Log, dataset: ob.Dataset, *, seed: int = 0) -> ob.Dataset:
-    """Hides 30 % of each sensor in silences of its own: what is to be filled in."""
+    """Masks 30 % of each sensor, in dropouts of its own, to be imputed."""
     return ob.mask_out(
         dataset,
         0.7,

@@ -1,9 +1,9 @@
-"""A Unitree G1 humanoid (LeRobot set): arms at 30 Hz, and hands whose slower values are held.
+"""A Unitree G1 humanoid (LeRobot set): arms at 30 Hz, and hands whose slower values are repeated.
 
     OFFBEAT_DATA=FOLDER python examples/real_g1.py --out results/real_logs --figures docs/figures
 
 The set is `unitree_g1_lerobot_v21` (100 episodes, 26 states). The hands repeat their value in about
-four rows of five; repeats are masked, so that no predictor is praised for repeating them.
+four rows of five; repeats are masked, so that no predictor is scored for repeating them.
 """
 
 from real_common import Log, data_folder, main
@@ -17,7 +17,13 @@ def g1(small: bool) -> Log:
     if not path.exists():
         raise SystemExit(f"{path} is not here; set OFFBEAT_DATA to the folder that has it")
     episodes = list(range(12)) if small else None
-    log = ob.read(path, episodes=episodes, columns=["observation.state"], repeated="mask")
+    log = ob.read(
+        path,
+        episodes=episodes,
+        columns=["observation.state"],
+        include_actions=False,
+        repeated="mask",
+    )
     hands = tuple(name for name in log.names if "Hand" in name)
     arms = tuple(name for name in log.names if "Hand" not in name)
     train, validation, test = ob.split(log, seed=0)

