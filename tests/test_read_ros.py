@@ -217,7 +217,7 @@ class TestABag:
         asked = one(path, topics=["/odom"], fields=["twist.covariance"]).signals[0]
         assert asked.channels[35] == "twist.covariance[35]"
 
-    def test_is_read_in_heaps_without_effect_on_the_result(self, write, monkeypatch):
+    def test_is_read_in_batches_without_effect_on_the_result(self, write, monkeypatch):
         messages = sorted(
             poses(write.store, 40)[2] + poses(write.store, 31, topic="/b")[2],
             key=lambda m: m[1],

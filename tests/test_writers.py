@@ -72,3 +72,14 @@ def test_unknown_formats_and_names_that_collide_are_refused(tmp_path):
     clash = ob.Dataset((ob.Trajectory([0.0], [[1.0]], names=("time",)),))
     with pytest.raises(ob.InputError, match="would have the name 'time'"):
         save(clash, tmp_path / "walk.csv")
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_every_format_keeps_times_values_names_and_units(tmp_path, name):
+    path = tmp_path / f"walk{WRITERS[name].suffixes[0]}"
+    save(made(), path, format=name)
+    again = ob.read(path)
+    assert (again.names, again.units) == (made().names, made().units)
+    for a, b in zip(again, made(), strict=True):
+        assert a.times.tolist() == b.times.tolist()
+        assert np.array_equal(a.values, b.values, equal_nan=True)
