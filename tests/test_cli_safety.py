@@ -107,6 +107,18 @@ def test_a_config_that_is_no_config_ends_in_one_line(text, tmp_path, capsys, mon
     assert not Path("marker").exists()
 
 
+@pytest.mark.parametrize("text", [BOMB, "model: " + "[" * 100_000], ids=["aliases", "deep"])
+def test_the_config_of_a_run_that_is_compared_is_read_within_bounds(text, tmp_path, capsys):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").write_text(text)
+        (tmp_path / name / "results.json").write_text("{}")
+    assert app.main(["compare", str(tmp_path / "a"), str(tmp_path / "b")]) == 2
+    error = capsys.readouterr().err
+    assert str(tmp_path / "a" / "config.yaml") in error
+    assert len(error.splitlines()) == 1
+
+
 @pytest.mark.parametrize("value", ["[" * 100_000, "{a: " * 200, BOMB])
 def test_a_typed_value_that_is_no_value_ends_in_one_line(value, tmp_path, capsys):
     for option in ("--seed", "--reader", "--split.sensors", "--model", "--reader.units"):

@@ -17,6 +17,7 @@ STAGES = (
     "errors",
     "registry",
     "files",
+    "safe_yaml",
     "tables",
     "config",
     "data",

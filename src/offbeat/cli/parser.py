@@ -27,14 +27,13 @@ from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first
     set_parsing_settings,
 )
 
+from offbeat import safe_yaml
+
 set_parsing_settings(
     instantiate_subclass_spec_in_any=False,
     import_path_denylist=["*"],
     add_print_completion_argument=True,
 )
-
-MOST_CHARACTERS, MOST_VALUES, DEEPEST = 200_000, 20_000, 20
-"""Bounds of a config: its length, its values once aliases are expanded, its nesting."""
 
 
 class Option(NamedTuple):
@@ -123,7 +122,7 @@ class CommandParser(ArgumentParser):
         self.fill()
         if self.function is not None:
             try:
-                _check_value([text.partition("=")[2] or text for text in args])
+                safe_yaml.check_value([text.partition("=")[2] or text for text in args])
             except yaml.YAMLError as error:
                 raise ArgumentError(None, f"a value can't be read: {error}") from None
             first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
@@ -139,8 +138,8 @@ class CommandParser(ArgumentParser):
     def _read(self, path: Path, before: Namespace | None) -> Namespace:
         try:
             with path.open(encoding="utf-8") as file:
-                values = _load(file.read(MOST_CHARACTERS + 1))
-            _check_value(values)
+                values = _load(file.read(safe_yaml.MOST_CHARACTERS + 1))
+            safe_yaml.check_value(values)
         except (OSError, UnicodeError, yaml.YAMLError) as error:
             raise ArgumentError(None, f"the config {path} can't be read: {error}") from None
         if not isinstance(values, dict):
@@ -247,70 +246,13 @@ def _function_of(options: Sequence[Option]) -> Callable[..., None]:
     return function
 
 
-def _checked(load: Callable[[str], Any]) -> Callable[[str], Any]:
-    """A loader of YAML that refuses what would take all memory or stack."""
-
-    def checked(text: str) -> Any:
-        _check(text)
-        return load(text)
-
-    return checked
+_load_yaml = get_loader("yaml")
 
 
-def _check(text: str) -> None:
-    """Refuses a text that is too large, nested too deeply, or too large once aliases are expanded.
-
-    Raises:
-        yaml.YAMLError: it is, or it is no YAML.
-    """
-    if len(text) > MOST_CHARACTERS:
-        raise _Unsafe(f"it is longer than {MOST_CHARACTERS} characters")
-    depth = 0
-    for event in yaml.parse(text, yaml.SafeLoader):  # the one pass of PyYAML without recursion
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise _Unsafe(f"it is nested more than {DEEPEST} deep")
-    node = yaml.compose(text, yaml.SafeLoader)
-    if node is not None:
-        _count(node, {})
+def _load(text: str) -> Any:
+    """As jsonargparse reads YAML, within the bounds of `safe_yaml`."""
+    safe_yaml.check(text)
+    return _load_yaml(text)
 
 
-def _check_value(value: Any) -> None:
-    """Refuses a value in which a text would be taken for YAML that `_check` refuses."""
-    if isinstance(value, str) and len(value) > DEEPEST:  # shorter ones can't nest deeper
-        try:
-            _check(value)
-        except _Unsafe:
-            raise
-        except yaml.YAMLError:  # then it is no YAML, but a name or a sentence
-            pass
-    elif isinstance(value, dict):
-        for part in value.items():
-            _check_value(part)
-    elif isinstance(value, list | tuple):
-        for part in value:
-            _check_value(part)
-
-
-class _Unsafe(yaml.YAMLError):
-    """What would take all memory or stack."""
-
-
-def _count(node: yaml.Node, seen: dict[int, int]) -> int:
-    """The values in a node, those behind aliases counted each time."""
-    if id(node) not in seen:
-        seen[id(node)] = MOST_VALUES + 1  # until it is known; an alias to a node around it stays so
-        inside: list[yaml.Node] = []
-        if isinstance(node, yaml.SequenceNode):
-            inside = node.value
-        elif isinstance(node, yaml.MappingNode):
-            inside = [part for pair in node.value for part in pair]
-        seen[id(node)] = 1 + sum(_count(part, seen) for part in inside)
-    if seen[id(node)] > MOST_VALUES:
-        raise _Unsafe(f"it holds more than {MOST_VALUES} values once aliases are expanded")
-    return seen[id(node)]
-
-
-_load = _checked(get_loader("yaml"))
 set_loader("yaml", _load, (yaml.YAMLError,))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from offbeat import safe_yaml
 from offbeat.errors import FileFormatError, one_of
 
 METRICS = ("after_first_observation", "masked", "after_first_row", "published")
@@ -99,9 +100,7 @@ def read_raw(path: Path) -> list[RawRun]:
 
 
 def _read_folder(folder: Path) -> RawRun:
-    import yaml
-
-    config = _load(folder / "config.yaml", yaml.safe_load)
+    config = _load(folder / "config.yaml", safe_yaml.load)
     results = _load(folder / "results.json", json.loads)
     try:
         model, training = config["model"], config["training"]

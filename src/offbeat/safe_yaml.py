@@ -1,0 +1,81 @@
+"""YAML from other people: bounds on what is read, whatever the text is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+MOST_CHARACTERS, MOST_VALUES, DEEPEST = 200_000, 20_000, 20
+"""Bounds of a text: its length, its values once aliases are expanded, its nesting."""
+
+
+class UnsafeYAMLError(yaml.YAMLError):
+    """A text that would take all memory or stack."""
+
+
+def load(text: str) -> Any:
+    """Reads plain values from a text, within the bounds.
+
+    Raises:
+        UnsafeYAMLError: it is beyond the bounds.
+        yaml.YAMLError: it is not YAML, or it names Python objects.
+    """
+    check(text)
+    return yaml.safe_load(text)
+
+
+def check(text: str) -> None:
+    """Refuses a text that is too large, nested too deeply, or too large once aliases are expanded.
+
+    Raises:
+        UnsafeYAMLError: it is.
+        yaml.YAMLError: it is not YAML.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise UnsafeYAMLError(f"it is longer than {MOST_CHARACTERS} characters")
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):  # the one pass of PyYAML without recursion
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            raise UnsafeYAMLError(f"it is nested more than {DEEPEST} deep")
+    node = yaml.compose(text, yaml.SafeLoader)
+    if node is not None:
+        _count(node, {})
+
+
+def check_value(value: Any) -> None:
+    """Refuses a value in which a text, should it be read as YAML, is one that `check` refuses.
+
+    Raises:
+        UnsafeYAMLError: it is.
+    """
+    if isinstance(value, str) and len(value) > DEEPEST:  # shorter ones can't nest deeper
+        try:
+            check(value)
+        except UnsafeYAMLError:
+            raise
+        except yaml.YAMLError:  # then it is no YAML, but a name or a sentence
+            pass
+    elif isinstance(value, dict):
+        for part in value.items():
+            check_value(part)
+    elif isinstance(value, list | tuple):
+        for part in value:
+            check_value(part)
+
+
+def _count(node: yaml.Node, seen: dict[int, int]) -> int:
+    """The values in a node, those behind aliases counted each time."""
+    if id(node) not in seen:
+        seen[id(node)] = MOST_VALUES + 1  # until it is known; an alias to a node around it stays so
+        inside: list[yaml.Node] = []
+        if isinstance(node, yaml.SequenceNode):
+            inside = node.value
+        elif isinstance(node, yaml.MappingNode):
+            inside = [part for pair in node.value for part in pair]
+        seen[id(node)] = 1 + sum(_count(part, seen) for part in inside)
+    if seen[id(node)] > MOST_VALUES:
+        raise UnsafeYAMLError(f"it holds more than {MOST_VALUES} values once aliases are expanded")
+    return seen[id(node)]
