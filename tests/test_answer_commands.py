@@ -28,7 +28,7 @@ MODEL = ["--model.hidden_size=4", "--model.field_units=[6]", "--training.epochs=
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Two sensors on one clock in ms: gyro and tilt at 100 Hz, height at 25 Hz; cells missing."""
+    """Two sensors on one clock in ms: gyro and tilt at 100 Hz, height at 25 Hz; values missing."""
     path = tmp_path_factory.mktemp("log") / "log.csv"
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -125,7 +125,7 @@ def test_extrapolate_answers_after_the_last_row_on_the_clock_of_the_log(run, log
     assert np.array_equal([[float(line[name]) for name in NAMES] for line in lines], expected)
 
 
-def test_evaluate_scores_fills_and_forecasts_of_the_part_held_out(run, log, capsys):
+def test_evaluate_scores_fills_and_forecasts_of_the_test_part(run, log, capsys):
     capsys.readouterr()
     arguments = ["evaluate", str(run), str(log), "--horizons=[0.02, 0.1]"]
     assert main([*arguments, "--json"]) == 0
@@ -146,17 +146,17 @@ def test_evaluate_scores_fills_and_forecasts_of_the_part_held_out(run, log, caps
         assert verdict in text
 
 
-def test_other_data_is_hidden_in_any_way_and_scored_as_a_whole(run, log, tmp_path, capsys):
+def test_other_data_is_masked_in_any_way_and_scored_as_a_whole(run, log, tmp_path, capsys):
     other = tmp_path / "other.csv"
     other.write_text("\n".join(log.read_text().splitlines()[:200]) + "\n")
     capsys.readouterr()
-    hiding = ["--observed_fraction=0.6", "--mask=values"]
-    assert main(["evaluate", str(run), str(other), *hiding, "--json"]) == 0
+    masking = ["--observed_fraction=0.6", "--mask=values"]
+    assert main(["evaluate", str(run), str(other), *masking, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["part"] == "all"
     data = ob.read(other, time_column="stamp", time_unit="ms")
-    hidden = ob.mask_out(data, 0.6, mask="values")[0]
-    expected = (data[0].observed & ~hidden.observed).sum(axis=0).tolist()
+    masked = ob.mask_out(data, 0.6, mask="values")[0]
+    expected = (data[0].observed & ~masked.observed).sum(axis=0).tolist()
     assert list(said["imputation"]["counts"].values()) == expected
 
 
@@ -177,7 +177,7 @@ def test_figures_are_written_on_request(run, log, tmp_path):
             assert picture.size[0] == 1400
 
 
-def test_a_figure_shows_observed_cells_hidden_truth_and_every_answer():
+def test_a_figure_shows_observed_values_masked_truth_and_every_answer():
     times = np.arange(6.0)
     values = times[:, None] ** 2
     observed = np.array([True, True, False, False, True, True])[:, None]
@@ -190,7 +190,7 @@ def test_a_figure_shows_observed_cells_hidden_truth_and_every_answer():
     assert drawn["Hidden truth"].get_xydata().tolist() == [[2, 4], [3, 9]]
     assert drawn["Observed"].get_xdata().tolist() == [0, 1, 4, 5]
     line = drawn["my_fill"].get_ydata()
-    assert line[1:5].tolist() == [1, 5, 10, 16], "from the last observed cell to the next"
+    assert line[1:5].tolist() == [1, 5, 10, 16], "from the last observed value to the next"
     assert np.isnan(line[[0, 5]]).all()
     assert axes.get_ylabel() == "a (m)"
 

@@ -258,7 +258,7 @@ def test_print_config_prints_yaml_that_can_be_overridden(tmp_path, capsys):
     assert config["split"]["observed_fraction"] is None
 
 
-def test_evaluate_scores_the_part_that_was_held_out_on_the_same_cells(run, data, capsys):
+def test_evaluate_scores_the_test_part_on_the_same_values(run, data, capsys):
     capsys.readouterr()
     assert main(["evaluate", str(run), str(data), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -282,7 +282,7 @@ def test_predict_answers_at_asked_times_in_original_units(run, data, tmp_path):
     )
 
 
-def test_predict_reads_a_csv_with_empty_cells_and_columns_in_another_order(run, data, tmp_path):
+def test_predict_reads_a_csv_with_empty_values_and_columns_in_another_order(run, data, tmp_path):
     names = list(ob.load(data).names)
     path = tmp_path / "log.csv"
     rows = [[f"{0.005 * i}", *(str(0.1 * i + j) if i % 2 else "" for j in range(14))] for i in

@@ -121,6 +121,12 @@ def test_the_config_of_a_run_that_is_compared_is_read_within_bounds(text, tmp_pa
 
 @pytest.mark.parametrize("value", ["[" * 100_000, "{a: " * 200, BOMB])
 def test_a_typed_value_that_is_no_value_ends_in_one_line(value, tmp_path, capsys):
+    inner = tmp_path / "model.yaml"
+    for wrapped in (value, json.dumps(value), json.dumps(json.dumps(value))):
+        inner.write_text(json.dumps({"hidden_size": wrapped}))
+        for name, given in (("--model", inner), ("--seed", wrapped)):
+            assert app.main(["train", "none.csv", str(tmp_path / "out"), name, str(given)]) == 2
+            assert len(capsys.readouterr().err.splitlines()) == 1
     for option in ("--seed", "--reader", "--split.sensors", "--model", "--reader.units"):
         assert app.main(["train", "none.csv", str(tmp_path / "out"), option, value]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1

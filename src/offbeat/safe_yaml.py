@@ -53,11 +53,13 @@ def check_value(value: Any) -> None:
     """
     if isinstance(value, str) and len(value) > DEEPEST:  # shorter ones can't nest deeper
         try:
-            check(value)
+            inside = load(value)
         except UnsafeYAMLError:
             raise
-        except yaml.YAMLError:  # then it is no YAML, but a name or a sentence
-            pass
+        except (yaml.YAMLError, ValueError):  # then it is no YAML, but a name or a sentence
+            return
+        if inside != value:
+            check_value(inside)
     elif isinstance(value, dict):
         for part in value.items():
             check_value(part)

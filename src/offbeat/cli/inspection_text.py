@@ -58,12 +58,12 @@ def channel_table(inspection: Inspection) -> str:
 
 
 def episode_table(inspection: Inspection) -> str:
-    """A line per episode; of many, those with faults and the first ones."""
+    """A line per episode; of many, those with anomalies and the first ones."""
     episodes = list(enumerate(inspection.episodes))
     shown = episodes
     if len(episodes) > _MOST_EPISODES:
-        faulty = [entry for entry in episodes if _is_faulty(entry[1])]
-        kept = {i for i, _ in [*faulty, *episodes][:_MOST_EPISODES]}
+        unclean = [entry for entry in episodes if not _is_clean(entry[1])]
+        kept = {i for i, _ in [*unclean, *episodes][:_MOST_EPISODES]}
         shown = [entry for entry in episodes if entry[0] in kept]
     rows = [
         (
@@ -91,7 +91,7 @@ def episode_table(inspection: Inspection) -> str:
     text = plain([header, *rows], left=(1, 5))
     if len(shown) == len(episodes):
         return text
-    clean = len(episodes) - sum(_is_faulty(e) for _, e in episodes)
+    clean = sum(_is_clean(e) for _, e in episodes)
     return (
         f"{text}\n({len(episodes) - len(shown)} more; {clean} of {len(episodes)} without anomalies)"
     )
@@ -103,8 +103,8 @@ def _before(episode: EpisodeInspection) -> str:
     return "clock set" if episode.clock_set_before else ""
 
 
-def _is_faulty(episode: EpisodeInspection) -> bool:
-    return bool(
+def _is_clean(episode: EpisodeInspection) -> bool:
+    return not (
         episode.late
         or episode.duplicates
         or episode.clock_set_before

@@ -37,7 +37,7 @@ set_parsing_settings(
 
 
 class Option(NamedTuple):
-    """An option that has no default: where it is not given, the command does not hear of it."""
+    """An option without a default: only where it is given, it is in the mapping of its group."""
 
     name: str
     type: Any
@@ -139,7 +139,6 @@ class CommandParser(ArgumentParser):
         try:
             with path.open(encoding="utf-8") as file:
                 values = _load(file.read(safe_yaml.MOST_CHARACTERS + 1))
-            safe_yaml.check_value(values)
         except (OSError, UnicodeError, yaml.YAMLError) as error:
             raise ArgumentError(None, f"the config {path} can't be read: {error}") from None
         if not isinstance(values, dict):
@@ -252,7 +251,10 @@ _load_yaml = get_loader("yaml")
 def _load(text: str) -> Any:
     """As jsonargparse reads YAML, within the bounds of `safe_yaml`."""
     safe_yaml.check(text)
-    return _load_yaml(text)
+    value = _load_yaml(text)
+    if value != text:
+        safe_yaml.check_value(value)
+    return value
 
 
 set_loader("yaml", _load, (yaml.YAMLError,))
