@@ -170,7 +170,6 @@ def test_a_stamp_that_no_clock_shows_is_left_out_and_said(write):
 def test_a_pointer_of_git_lfs_says_so(tmp_path):
     path = tmp_path / "a.ulg"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 130\n")
-    assert not ulog.recognises(path)
     refused(path, "git lfs pull")
 
 

@@ -9,7 +9,7 @@ from offbeat.errors import FileFormatError
 
 _PROC = Path("/proc")
 _GROUPS = Path("/sys/fs/cgroup")
-_PER_CELL, _PER_ROW = 9, 32  # bytes: a value and its mask; stamps, times and steps
+_PER_VALUE, _PER_ROW = 9, 32  # bytes: a value and its mask; stamps, times and steps
 
 
 def require_rows(
@@ -27,7 +27,7 @@ def require_rows(
     Raises:
         FileFormatError: it does not.
     """
-    need = copies * rows * (channels * _PER_CELL + _PER_ROW)
+    need = copies * rows * (channels * _PER_VALUE + _PER_ROW)
     require_memory(path, need, f"{rows} rows x {channels} channels", instead)
 
 

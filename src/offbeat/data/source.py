@@ -12,6 +12,15 @@ PICKLE_SUFFIXES = (".pkl", ".pickle", ".p", ".pt", ".pth", ".joblib", ".dill")
 _PICKLE_STARTS = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 
 
+def starts_with(path: Path, starts: bytes | tuple[bytes, ...]) -> bool:
+    """Whether a file begins with certain bytes; False where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).startswith(starts)
+    except OSError:
+        return False
+
+
 def require_file(path: str | Path) -> Path:
     """Returns the path of a file that is there, is not empty, and holds data of its own.
 

@@ -15,7 +15,7 @@ from offbeat.data.readers.columns import Coded, Coder, Columns, Gathered
 from offbeat.errors import FileFormatError
 
 
-class NullCellError(Exception):
+class NullValueError(Exception):
     """A row has no time, or no label of its trajectory or channel."""
 
     def __init__(self, column: str, row: int) -> None:
@@ -36,7 +36,7 @@ def gather(
         capacity: at least the number of rows; what is too much costs address space alone.
 
     Raises:
-        NullCellError: a time, label or key is missing.
+        NullValueError: a time, label or key is missing.
         FileFormatError: the time is of no type that counts.
         OverflowError: a time of decimals exceeds an int64 of nanoseconds.
     """
@@ -82,7 +82,7 @@ def gather_columns(
         widths: how many channels a column of lists gives.
 
     Raises:
-        NullCellError, FileFormatError, OverflowError: as `gather`.
+        NullValueError, FileFormatError, OverflowError: as `gather`.
     """
     clock = np.concatenate([clock_of(c) for c in _known(sources[0](columns.time), columns.time)])
     coded: list[Coded | None] = []
@@ -191,8 +191,16 @@ def _without_nulls(column: Any, name: str, before: int) -> Any:
         empty = pc.or_kleene(empty, pc.equal(column, ""))
     flags = empty.fill_null(True).to_numpy(zero_copy_only=False)
     if flags.any():
-        raise NullCellError(name, before + int(flags.argmax()))
+        raise NullValueError(name, before + int(flags.argmax()))
     return column
+
+
+def is_list(kind: Any) -> bool:
+    """Whether an Arrow type is one of lists."""
+    import pyarrow as pa
+
+    lists = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+    return any(fits(kind) for fits in lists)
 
 
 def line_error(path: Path, error: Any) -> FileFormatError:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from offbeat.data.cleaning.clocks import state_time_unit, time_column_of, to_nanoseconds
 from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
-from offbeat.data.source import require_file
+from offbeat.data.source import require_file, starts_with
 from offbeat.errors import FileFormatError, InputError, one_of, require
 
 SUFFIXES = (".hdf5", ".h5", ".hdf")
@@ -41,11 +41,7 @@ def recognises(path: Path) -> bool:
     """Whether a file starts like HDF5, or a folder is a data set of Minari."""
     if path.is_dir():
         return any((path / name).is_file() for name in _MAIN)
-    try:
-        with path.open("rb") as file:
-            return file.read(len(_MAGIC)) == _MAGIC
-    except OSError:
-        return False
+    return starts_with(path, _MAGIC)
 
 
 def recordings(

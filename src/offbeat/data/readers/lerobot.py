@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import state_time_unit, to_nanoseconds
 from offbeat.data.memory import require_rows
+from offbeat.data.readers.batches import is_list
 from offbeat.data.readers.lerobot_info import WIDEST, Feature, Info, Rows, read_columns
 from offbeat.data.signals import Recording, Signal
 from offbeat.errors import FileFormatError, one_of
@@ -197,7 +198,7 @@ def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:
     import pyarrow as pa
 
     column = table.column(name).combine_chunks()
-    while _is_list(column.type):
+    while is_list(column.type):
         column = column.flatten()
     if pa.types.is_timestamp(column.type):
         column = column.cast(pa.timestamp("ns")).cast(pa.int64())
@@ -207,14 +208,6 @@ def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:
     if values.dtype.kind not in "iuf":
         raise FileFormatError(f"{file} has {column.type} in column {name!r}, expected times")
     return values
-
-
-def _is_list(kind: Any) -> bool:
-    import pyarrow as pa
-
-    return bool(
-        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    )
 
 
 def _matrix(table: Any, features: list[Feature], file: Path) -> NDArray[np.float64]:
@@ -233,7 +226,7 @@ def _column(table: Any, name: str, width: int, file: Path) -> NDArray[np.float64
     import pyarrow as pa
 
     column = table.column(name).combine_chunks()
-    while _is_list(column.type):
+    while is_list(column.type):
         column = column.flatten()
     numeric = pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
     if pa.types.is_boolean(column.type):

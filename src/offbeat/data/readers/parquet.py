@@ -11,7 +11,7 @@ from typing import Any
 
 from offbeat.data.cleaning.clocks import state_time_unit, time_column_of
 from offbeat.data.memory import require_rows
-from offbeat.data.readers.batches import NullCellError, gather_columns, line_error
+from offbeat.data.readers.batches import NullValueError, gather_columns, is_list, line_error
 from offbeat.data.readers.columns import Columns, listed, recordings
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
@@ -90,7 +90,7 @@ def read_parquet(
             widths = {
                 name: _width(path, name, chunks(name))
                 for name in columns.channels
-                if _is_list(schema.field(name).type)
+                if is_list(schema.field(name).type)
             }
             notes: tuple[str, ...] = ()
             kind = schema.field(columns.time).type
@@ -107,7 +107,7 @@ def read_parquet(
                 other = pq.ParquetFile(path, metadata=file.metadata, **bounded)
                 sources.append(functools.partial(_chunks, opened.enter_context(other)))
             table = gather_columns(sources, columns, rows, widths=widths)
-    except NullCellError as error:
+    except NullValueError as error:
         raise FileFormatError(
             f"{path} has an empty value in row {error.row}, column {error.column!r}, where every "
             "row needs a value; drop that row"
@@ -166,7 +166,7 @@ def _check_types(path: Path, schema: Any, columns: Columns) -> None:
         )
     for name in columns.channels:
         kind = schema.field(name).type
-        inner = kind.value_type if _is_list(kind) else kind
+        inner = kind.value_type if is_list(kind) else kind
         numbers = (
             pa.types.is_integer,
             pa.types.is_floating,
@@ -186,14 +186,6 @@ def _is_no_label(kind: Any) -> bool:
 
     binary = (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_fixed_size_binary)
     return pa.types.is_nested(kind) or any(fits(kind) for fits in binary)
-
-
-def _is_list(kind: Any) -> bool:
-    import pyarrow as pa
-
-    return bool(
-        pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind)
-    )
 
 
 def _width(path: Path, name: str, chunks: Iterator[Any]) -> int:

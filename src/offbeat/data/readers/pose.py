@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from offbeat.data.memory import require_memory
-from offbeat.data.readers.batches import NullCellError, gather
+from offbeat.data.readers.batches import NullValueError, gather
 from offbeat.data.readers.columns import Columns, recordings
 from offbeat.data.readers.table import read_csv
 from offbeat.data.recording import Recording, Signal
@@ -64,7 +64,7 @@ def read_tum(path: str | Path) -> list[Recording]:
             ).to_batches()
             table = gather(batches, _TUM, text.count(b"\n") + 1)
             break
-        except (pa.ArrowException, OverflowError, NullCellError):
+        except (pa.ArrowException, OverflowError, NullValueError):
             _explain(path)
     else:
         raise FileFormatError(f"{path} can't be read as TUM text; expected {' '.join(TUM_COLUMNS)}")

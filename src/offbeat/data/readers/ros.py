@@ -14,7 +14,7 @@ from offbeat.data.readers.options import Fields, names
 from offbeat.data.readers.ros_files import Bag, Connection, explained, open_bag
 from offbeat.data.readers.ros_topic import Topic
 from offbeat.data.signals import Recording, Signal
-from offbeat.data.source import require_file
+from offbeat.data.source import require_file, starts_with
 from offbeat.errors import FileFormatError, one_of, require
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -47,11 +47,7 @@ def recognises(path: Path) -> bool:
     """Whether a file starts like a ROS bag or an MCAP file, or a folder holds a ROS 2 bag."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
-    try:
-        with path.open("rb") as file:
-            return file.read(16).startswith(_MAGIC)
-    except OSError:
-        return False
+    return starts_with(path, _MAGIC)
 
 
 def recordings(

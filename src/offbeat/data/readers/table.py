@@ -12,7 +12,7 @@ from typing import Any
 
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER, state_time_unit
 from offbeat.data.memory import require_rows
-from offbeat.data.readers.batches import NullCellError, gather, line_error
+from offbeat.data.readers.batches import NullValueError, gather, line_error
 from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
 from offbeat.data.readers.stamps import expected_after, form_of, with_stamps
 from offbeat.data.recording import Recording
@@ -209,7 +209,7 @@ class _CsvFile:
                     self._explain(header, columns, sample)
                     raise line_error(self.path, error) from None
                 continue
-            except NullCellError as error:
+            except NullValueError as error:
                 raise self._empty(error, columns) from None
             if not len(table.clock):
                 raise FileFormatError(
@@ -250,7 +250,7 @@ class _CsvFile:
         """The line in which a row of data ends, counted from 1; the header is line 1."""
         return next(line for i, (line, _) in enumerate(self._lines()) if i == row + 1)
 
-    def _empty(self, error: NullCellError, columns: Columns) -> FileFormatError:
+    def _empty(self, error: NullValueError, columns: Columns) -> FileFormatError:
         line = self.line_of(error.row)
         if error.column == columns.time:
             return FileFormatError(

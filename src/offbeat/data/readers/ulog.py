@@ -30,7 +30,6 @@ DEFAULTS = {
 }
 """Topics, and their fields, that are read where none are asked for: how the vehicle moves."""
 
-_MAGIC = b"ULog\x01\x12\x35"
 _LATEST_US = 2**53  # 285 years; a later stamp is damage
 
 # By the definitions of PX4's messages.
@@ -56,15 +55,6 @@ _UNITS = {
     "vehicle_rates_setpoint": dict.fromkeys(("roll", "pitch", "yaw"), "rad/s"),
 }
 _QUATERNIONS = ("q", "q_d", "delta_q_reset", "q_offset")
-
-
-def recognises(path: Path) -> bool:
-    """Whether a file starts like a ULog."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(_MAGIC)) == _MAGIC
-    except OSError:
-        return False
 
 
 def recordings(
