@@ -106,8 +106,8 @@ class Illustrations:
             arrays |= {f"before:{m}": v for m, v in self.trace.before.items()}
             arrays |= {f"after:{m}": v for m, v in self.trace.after.items()}
         if self.map is not None:
-            facts = (self.map.colour, self.map.name, self.map.unit)
-            arrays |= dict(zip(_MAP, facts, strict=True))
+            described = (self.map.colour, self.map.name, self.map.unit)
+            arrays |= dict(zip(_MAP, described, strict=True))
             arrays |= {f"place:{m}": v for m, v in self.map.places.items()}
         path = Path(folder) / FILE
         with atomic_path(path) as temporary:

@@ -233,9 +233,9 @@ class Protocol:
         """What a model of the record consists of.
 
         The two fair models keep the thesis' readout and clock. Without self-feeding they see what
-        the ODE models see; both update at every row, and GRU is given the age of each channel
-        (equation 25), so that it knows how old its last observation is. The controls are the rows
-        of the thesis without self-feeding, and differ from them in nothing else.
+        the ODE models see; both update at every row, and GRU is given the time since each
+        channel's last observation (equation 25). The controls are the rows of the thesis without
+        self-feeding, and differ from them in nothing else.
 
         Args:
             label: one of `MODELS`.

@@ -59,9 +59,9 @@ class Circumstances:
         """
         folder = Path(folder)
         about = _mapping(_json(folder / "about.json"))
-        told = [_json(folder / f"{name}.json") for name in SESSIONS]
+        kept = [_json(folder / f"{name}.json") for name in SESSIONS]
         sessions = next(
-            filter(None, map(_rows, [*told, *(about.get(name) for name in SESSIONS)])), []
+            filter(None, map(_rows, [*kept, *(about.get(name) for name in SESSIONS)])), []
         )
         spent = [one.get("seconds") for one in sessions]
         known = [s for s in spent if isinstance(s, int | float)]

@@ -88,7 +88,7 @@ def beyond_the_thesis(families: Families) -> tuple[Finding, ...]:
         ),
         Finding(
             f"ODE-RNN and ODE-GRU-D are better than {fair}, which are not self-fed either, update "
-            "at every row, GRU with the age of each channel as input.",
+            "at every row, GRU with the time since each channel's last observation as input.",
             "Conclusion 1 of the thesis, with plain models that see more",
             better("against_fair", FAIR),
         ),

@@ -272,7 +272,7 @@ class Contents:
         )
 
     @property
-    def faults(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """What makes numbers hard to compare, a sentence each."""
         return (
             *self.circumstances.departures,

@@ -61,7 +61,7 @@ def document(contents: Contents) -> str:
             _pictures(contents),
             _method(contents),
         ],
-        top=page.warning((*contents.faults, *contents.missing)),
+        top=page.warning((*contents.warnings, *contents.missing)),
         foot="Made by python -m thesis report. The page needs no network; the files beside it hold "
         "each table as CSV, Markdown and LaTeX, and each figure as PNG and PDF.",
     )

@@ -178,12 +178,12 @@ def _exactly(outcomes: Sequence[tuple[bool, bool, bool]]) -> tuple[int, int]:
     Args:
         outcomes: per part, whether a difference is claimed, the first model is better, is worse.
     """
-    right = wrong = silent = 0
+    right = wrong = unclaimed = 0
     for claimed, better, worse in outcomes:
         right += claimed and better
         wrong += worse or (better and not claimed)
-        silent += not claimed and not better and not worse
-    return right + silent * bool(right or wrong), wrong
+        unclaimed += not claimed and not better and not worse
+    return right + unclaimed * bool(right or wrong), wrong
 
 
 def rule_significance(rules: Sequence[Rule], better_at: Sequence[float]) -> Verdict:

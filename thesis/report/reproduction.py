@@ -115,7 +115,7 @@ def write_report(
     write_text(out / PAGE, document(contents))
     write_text(answers, summarised(contents))
     return ReportFiles(
-        out / PAGE, answers, tuple(tables), tuple(pictures), (*contents.faults, *contents.missing)
+        out / PAGE, answers, tuple(tables), tuple(pictures), (*contents.warnings, *contents.missing)
     )
 
 

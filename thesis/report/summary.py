@@ -28,7 +28,7 @@ DOCUMENT = f"{REPORT} --summary docs/reproduction.md"
 _OURS = "ode_gru_d"
 
 _INFERRED = (
-    "That the thesis' scores contain the observed row 0, zero where it is hidden (the constant c): "
+    "That the thesis' scores contain the observed row 0, zero where it is masked (the constant c): "
     "its code and data are not public. The evidence is that its numbers come out, and that they "
     "grow nearly linearly with the masked fraction.",
     "That its GRU and GRU-D were fed their own predictions at half of the rows "
@@ -75,9 +75,9 @@ def _top(contents: Contents) -> str:
             f"What needs the other {asked - there} is left open: it reads '{say.MISSING}' or "
             f"'{DASH}'. {_missing(contents)}"
         )
-    faults = f"{' '.join(contents.faults)}\n\n" if contents.faults else ""
+    warnings = f"{' '.join(contents.warnings)}\n\n" if contents.warnings else ""
     return (
-        f"{' '.join(lines)}\n\n{faults}"
+        f"{' '.join(lines)}\n\n{warnings}"
         f"Made by `{DOCUMENT}` from the results that `report.html` shows, and not edited. Test "
         "errors in the thesis' scaled units. *Published scoring* is the thesis' own; *scoring "
         "after the first observation* counts the rows after the first observed one of their "
@@ -235,7 +235,7 @@ def _self_feeding(contents: Contents) -> Iterable[str]:
         "lower error. Bold: significant by the paired t test after Holm. The models that are not "
         "self-fed are the thesis' rows without self-feeding, and nothing else is changed: their "
         "rows show what it does by itself. The fair models also update at every row, and GRU is "
-        "given the age of each channel."
+        "given the time since each channel's last observation."
     )
     yield _source("`tables/table-a-6.csv`, `tables/table-a-7.csv`, `tables/table-a-8.csv`")
 

@@ -39,7 +39,7 @@ def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
         blocks,
         "Bold: the lowest of its column within a block, where all are there. Not self-fed: "
         "the thesis' rows without self-feeding. Fair: not self-fed either, updated at every "
-        "row, GRU with the age of each channel as input.",
+        "row, GRU with the time since each channel's last observation as input.",
         missing_runs(record, 2, MODELS, repeats),
     )
 
@@ -67,7 +67,7 @@ def distance_table(record: Record, *, number: str) -> Table:
         rows.append((label(model), tuple(cells)))
         needed.append((label(model), _constants_needed(record, model)))
     ours = [constant_of(record, fraction) for fraction in thesis.FRACTIONS]
-    facts = {
+    lines = {
         "Mean square of row 0, c": [c[0] for c in ours],
         "Fraction of masked rows 0": [c[1] for c in ours],
         f"Part of the published MSE, c {TIMES} fraction / 100": [c[2] for c in ours],
@@ -87,7 +87,7 @@ def distance_table(record: Record, *, number: str) -> Table:
                         for v in values
                     ),
                 )
-                for name, values in facts.items()
+                for name, values in lines.items()
             ),
         ),
         Block("c at which our mean would be the thesis' (inferred)", tuple(needed)),
@@ -106,7 +106,7 @@ def distance_table(record: Record, *, number: str) -> Table:
 def _constants_needed(record: Record, model: str) -> tuple[Cell, ...]:
     """The c of which `0.99 rows_1_99 + c fraction / 100` would have the thesis' mean RMSE.
 
-    A dash where there is none: the rest alone is above it, or no row 0 is hidden in some run.
+    A dash where there is none: the rest alone is above it, or no row 0 is masked in some run.
     """
     from scipy.optimize import brentq
 

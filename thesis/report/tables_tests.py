@@ -32,7 +32,8 @@ SCORING_NAMES = {
 _SIGNIFICANT = f"Bold: below the level of significance, {thesis.ALPHA:g}."
 _FAIR = (
     "Not self-fed: the thesis' rows without self-feeding, and nothing else changed. Fair: not "
-    "self-fed either; they also update at every row, and GRU is given the age of each channel."
+    "self-fed either; they also update at every row, and GRU is "
+    "given the time since each channel's last observation."
 )
 _CAVEAT = (
     "The rule takes the two samples to be independent. The runs share windows and masks within a "

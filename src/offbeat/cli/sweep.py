@@ -23,6 +23,7 @@ def sweep_command(
     engine: str = "local",
     processes: int | None = None,
     threads: int = 1,
+    device: str = "cpu",
     budget_minutes: float | None = None,
     mixed: str = "refuse",
     engine_options: dict[str, str | int | float | bool | None] | None = None,
@@ -49,6 +50,7 @@ def sweep_command(
         engine: local (processes of this machine), ray or slurm.
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.
+        device: that models are trained on: cpu, cuda or cuda:1.
         budget_minutes: stop after so long; the same command continues later.
         mixed: where out has runs of other code, of another processor, backend, torch or data,
             refuse to continue, accept them (the record marks them), or redo them.
@@ -78,6 +80,7 @@ def sweep_command(
         engine=engine,
         processes=processes,
         threads=threads,
+        device=device,
         budget_minutes=budget_minutes,
         mixed=mixed,
         engine_options=engine_options,

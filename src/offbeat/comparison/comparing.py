@@ -103,8 +103,8 @@ def compare(
         try:
             pairs = [(*two, *_pair(table, two, alpha, options)) for two in couples]
             together = friedman(table, alpha=alpha) if len(there) > 2 else None
-        except InputError as fault:
-            raise InputError(f"{condition}: {fault}") from None
+        except InputError as failure:
+            raise InputError(f"{condition}: {failure}") from None
         found.append(
             (condition, repeats, _summaries(scores, condition, repeats, table), pairs, together)
         )
@@ -185,8 +185,8 @@ def _provenance(compared: Iterable[Run]) -> list[str]:
     for what in PROVENANCE:
         counts = Counter(run.origin[what] for run in runs if what in run.origin)
         if len(counts) > 1:
-            told = ", ".join(f"{value} ({number})" for value, number in counts.most_common())
-            notes.append(f"The runs differ in {what.replace('_', ' ')}: {told}")
+            values = ", ".join(f"{value} ({number})" for value, number in counts.most_common())
+            notes.append(f"The runs differ in {what.replace('_', ' ')}: {values}")
     return notes
 
 

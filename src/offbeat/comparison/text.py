@@ -74,8 +74,8 @@ def to_dict(comparison: Comparison) -> dict[str, Any]:
     """JSON-like form of every number; null where there is none."""
     result: dict[str, Any] = _jsonable(asdict(comparison))
     result["family"] = comparison.family
-    for told, condition in zip(result["conditions"], comparison.conditions, strict=True):
-        for entry, pair in zip(told["pairs"], condition.pairs, strict=True):
+    for entries, condition in zip(result["conditions"], comparison.conditions, strict=True):
+        for entry, pair in zip(entries["pairs"], condition.pairs, strict=True):
             entry["thesis"] |= {
                 "test": pair.thesis.test,
                 "normal": pair.thesis.normal,

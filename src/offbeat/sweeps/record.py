@@ -53,6 +53,7 @@ class Record:
         "commit": str,
         "bits": str,
         "cpu": str,
+        "device": str,
         "scan_backend": str,
         "threads": int,
         "torch": str,
@@ -79,7 +80,7 @@ class Record:
     }
     """Columns of the table of curves, each with its name in the `log.csv` of a training."""
 
-    GROUP: ClassVar[tuple[str, ...]] = ("bits", "cpu", "scan_backend", "torch", "data")
+    GROUP: ClassVar[tuple[str, ...]] = ("bits", "cpu", "device", "scan_backend", "torch", "data")
     """Runs that agree in these were made alike; others are never mixed without a message."""
 
     runs: Mapping[str, Row]

@@ -83,6 +83,7 @@ def run_plan(
     mixed: str = "refuse",
     processes: int | None = None,
     threads: int = 1,
+    device: str = "cpu",
     budget_minutes: float | None = None,
     engine_options: Mapping[str, Any] | None = None,
     progress: bool = True,
@@ -104,6 +105,7 @@ def run_plan(
             marked, or `redo` them.
         processes: runs at a time; by default as many as there is room for.
         threads: of each run.
+        device: that models are trained on: `cpu`, `cuda` or `cuda:1`.
         budget_minutes: stop after so long, in the middle of runs; they go on next time.
         engine_options: of Ray or Slurm.
         progress: show how far it is on standard error.
@@ -125,10 +127,14 @@ def run_plan(
         _same_plan(out, plan)
         recorded, fingerprint = _data(out, plan, dataset, progress)
         tasks = {
-            run.run_id: Task(run, plan, recorded, fingerprint, out / "runs" / run.run_id, threads)
+            run.run_id: Task(
+                run, plan, recorded, fingerprint, out / "runs" / run.run_id, threads, device
+            )
             for run in plan.runs()
         }
-        here = plan.record.group_of({**plan.provenance(), "data": fingerprint[:12]})
+        here = plan.record.group_of(
+            {**plan.provenance(), "data": fingerprint[:12], "device": device}
+        )
         shown = Progress(out / "status.json", show=progress)
         kept = _known(out, record, tasks, plan)
         kept = _unmixed(kept, mixed, tasks, here, shown)

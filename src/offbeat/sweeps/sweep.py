@@ -140,6 +140,7 @@ def sweep(
     engine: str = "local",
     processes: int | None = None,
     threads: int = 1,
+    device: str = "cpu",
     budget_minutes: float | None = None,
     mixed: str = "refuse",
     engine_options: Mapping[str, Any] | None = None,
@@ -168,6 +169,7 @@ def sweep(
             see `out` under the same path.
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.
+        device: that models are trained on: `cpu`, `cuda` or `cuda:1`.
         budget_minutes: stop after so long, in the middle of runs; they go on next time.
         mixed: what to do with runs in `out` that were made by other code, on another processor,
             with another backend, torch or data: `refuse` to go on, `accept` or `redo` them.
@@ -200,6 +202,7 @@ def sweep(
         mixed=mixed,
         processes=processes,
         threads=threads,
+        device=device,
         budget_minutes=budget_minutes,
         engine_options=engine_options,
         progress=progress,

@@ -41,6 +41,7 @@ class Task:
         fingerprint: of their content.
         folder: of the run: config.json, training/ (log.csv, checkpoints, model), scores.json.
         threads: of torch.
+        device: that the model is trained on.
     """
 
     run: Run
@@ -49,6 +50,7 @@ class Task:
     fingerprint: str
     folder: Path
     threads: int = 1
+    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -105,18 +107,20 @@ class Task:
             "training": asdict(training),
             "data": self.fingerprint,
             "threads": self.threads,
+            "device": self.device,
             "provenance": here,
         }
         before = _take_up(self.folder, config)
         started, out = time.time(), self.folder / TRAINING
         write_json(self.folder / CONFIG, {**config, "began": started, "seconds_before": before})
+        options: dict[str, Any] = {"out": out, "device": self.device, "progress": False}
         try:
-            fitted = fit(model, train, validation, training, out=out, progress=False)
+            fitted = fit(model, train, validation, training, **options)
         except FileFormatError:  # a power cut can leave a checkpoint that is not whole
             shutil.rmtree(out)
             before, started = 0.0, time.time()
             model = make_model(chosen, train, scaler=scaler, seed=run.seed_weights)
-            fitted = fit(model, train, validation, training, out=out, progress=False)
+            fitted = fit(model, train, validation, training, **options)
         evaluation = evaluate({run.model: model}, test, seed=run.seed_draw)
         row: dict[str, Any] = {
             **named,
@@ -126,6 +130,7 @@ class Task:
             "seconds": before + time.time() - started,
             **here,
             "threads": self.threads,
+            "device": self.device,
             "data": self.fingerprint[:12],
             "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
             **plan.columns(run, model, test, recorded),

@@ -146,7 +146,7 @@ class ThesisTest:
 
     @property
     def normal(self) -> bool:
-        """Neither sample is told from a normal one, as the rule presumes."""
+        """Neither sample differs significantly from a normal one, as the rule presumes."""
         return min(self.shapiro_a.p, self.shapiro_b.p) > self.alpha
 
     @property
