@@ -56,9 +56,6 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
     channels = Channels.of(given, options)
     unit = _common([recording.time_unit for recording in given], "ns")
     labelled = any(recording.label for recording in given)
-    for recording in given:
-        for signal in recording.signals:
-            owned(signal.values)
     del given
     log = CleaningLog(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
     episodes: list[Episode] = []

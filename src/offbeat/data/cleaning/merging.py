@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.arrays import owned
 from offbeat.data.cleaning import anomalies
 from offbeat.data.cleaning.channels import find_quaternions
 from offbeat.data.cleaning.log import CleaningLog
@@ -166,6 +167,8 @@ def cut(
     recording: Recording, channels: Channels, options: ReaderOptions, log: CleaningLog
 ) -> list[Episode]:
     """The episodes of a recording: its rows in order, its signals merged, split at outages."""
+    for signal in recording.signals:
+        owned(signal.values)  # from here on, what is cleaned is copied first
     kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
     signals = [signal for signal in kept if signal is not None]
     if not signals:
