@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import owned as hand_over
 from offbeat.data.cleaning import anomalies
 from offbeat.data.cleaning.channels import find_quaternions
 from offbeat.data.cleaning.log import CleaningLog
@@ -168,7 +168,7 @@ def cut(
 ) -> list[Episode]:
     """The episodes of a recording: its rows in order, its signals merged, split at outages."""
     for signal in recording.signals:
-        owned(signal.values)  # from here on, what is cleaned is copied first
+        hand_over(signal.values)  # from here on, what is cleaned is copied first
     kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
     signals = [signal for signal in kept if signal is not None]
     if not signals:
