@@ -42,7 +42,10 @@ from offbeat import (
     save_model,
     thesis_config,
 )
-from offbeat.models.zoo import THESIS_MODELS, ZOO, resolve
+from offbeat.models.zoo import MODELS, THESIS_MODELS, resolve
+from offbeat.parts import CELLS, FIELDS, HEADS
+
+ZOO = [name for name, entry in MODELS.items() if entry.factory is None]
 
 FLOAT32, FLOAT64 = torch.float32, torch.float64
 TOLERANCE = {FLOAT32: 1e-6, FLOAT64: 1e-12}
@@ -62,6 +65,11 @@ def option_sets(name: str) -> dict[str, dict[str, Any]]:
             sets["self_feeding"] = {"self_feeding": 0.5}
     if entry.cell == "gru":
         sets["reset_after"] = {"reset_after": True, "readout": "last_row"}
+    if name in ("gru", "anchored_ode_gru_d"):
+        sets |= {head: {"head": head} for head in HEADS if head != "point"}
+    if name == "ode_rnn":
+        sets |= {cell: {"cell": cell} for cell in CELLS if cell not in ("gru", "start")}
+        sets |= {field: {"vector_field": field} for field in FIELDS if field != "mlp"}
     if entry.vector_field == "mlp":
         sets["dopri5"] = {"solver": "dopri5"}
         sets["max_step"] = {"solver": "midpoint", "max_step": 0.2, "activation": "silu"}

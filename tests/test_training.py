@@ -436,3 +436,15 @@ def test_a_checkpoint_records_the_backend_that_ran(tmp_path):
     ob.fit(model, TRAIN, config=ob.TrainConfig(epochs=1), out=tmp_path, progress=False)
     (folder,) = (tmp_path / "checkpoints").iterdir()
     assert json.loads((folder / "config.json").read_text())["training"]["backend"] == "reference"
+
+
+@pytest.mark.slow
+def test_the_default_model_beats_the_last_value_on_hopper_with_no_options():
+    recorded = ob.simulate("hopper", n_trajectories=200, rows=100, seed=0)
+    train, validation, test = ob.split(ob.mask_out(recorded, 0.3, seed=0), seed=0)
+    model = ob.make_model(ob.ModelConfig(), train)
+    result = ob.fit(model, train, validation, progress=False)
+    assert result.steps <= 700
+    scores = ob.evaluate({"model": model}, test).scores
+    rmse = {name: s.after_first_observation.rmse for name, s in scores.items()}
+    assert rmse["model"] < 0.9 * rmse["last_value"]
