@@ -42,6 +42,7 @@ from offbeat import (
     save_model,
     thesis_config,
 )
+from offbeat.models.model import Output
 from offbeat.models.zoo import MODELS, THESIS_MODELS, resolve
 from offbeat.parts import CELLS, FIELDS, HEADS
 
@@ -255,7 +256,8 @@ def test_hidden_values_leave_no_trace_in_gradients(variant: str) -> None:
     found = []
     for given in (batch, hidden):
         model.zero_grad()
-        (model(given).mean * batch.valid[..., None]).square().sum().backward()
+        output = model(given)
+        (whole(output) * batch.valid[..., None]).square().sum().backward()
         found.append([p.grad.clone() for p in model.parameters() if p.grad is not None])
     for got, expected in zip(*found, strict=True):
         assert torch.equal(got, expected)
@@ -406,10 +408,15 @@ def test_asked_times_change_no_other_prediction_or_are_refused(name: str, choice
 # --- gradients ------------------------------------------------------------------------------------
 
 
+def whole(output: Output) -> Tensor:
+    """Mean, and with a head that has one, scale: a gradient reaches every part of the head."""
+    return output.mean if output.scale is None else output.mean + output.scale
+
+
 def gradients(model: Model, batch: Batch) -> dict[str, Tensor | None]:
     model.zero_grad()
     target = torch.cos(torch.arange(batch.values.numel()).to(model.dtype)).view_as(batch.values)
-    loss = ((model(batch).mean - target) * batch.valid[..., None]).square().sum()
+    loss = ((whole(model(batch)) - target) * batch.valid[..., None]).square().sum()
     loss.backward()
     return {name: p.grad for name, p in model.named_parameters()}
 
