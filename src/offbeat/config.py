@@ -39,12 +39,12 @@ class ModelConfig:
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver, in units of the state.
         gradient: `backprop` through the solver's steps, or the `adjoint` method (algorithm 1).
-        decay: `none`; `trainable`, the gamma_h of equation 26 from the ages of all channels;
-            `vector` or `scalar`, exp(-tau gap) with one tau per unit or one in all (equation 42).
+        decay: `none`; `trainable`, the gamma_h of equation 26 from the times since observation of
+            all channels; `vector` or `scalar`, exp(-tau gap) with one tau per unit or one in all (equation 42).
         decay_rows: `continuous`, the decay is a function of time alone, whatever rows it is asked
-            at; `every_row`, gamma of the age compounds at every row (the thesis' protocol);
+            at; `every_row`, gamma compounds at every row (the thesis' protocol);
             `observed_rows`, the state decays only where it is updated.
-        input_decay: gamma_x, last values that fade to the training mean (equation 27).
+        input_decay: gamma_x, last values that decay to the training mean (equation 27).
         anchored: the state holds the channels themselves, and an observation sets them.
         update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
         time_input: the time that a plain cell is given: `elapsed` since the last observed row,
@@ -55,8 +55,8 @@ class ModelConfig:
             values, and can take longer to learn from.
         self_feeding: fraction of rows at which the cell's input is the model's own decoded
             prediction in place of the observed values (one draw per row for the whole batch,
-            row 0 excepted), in training and in testing. A fault of public code, kept by name.
-        readout: `target`, the state is carried to the time asked for; `last_row`, the prediction
+            row 0 excepted), in training and in testing. Some public code does so by mistake.
+        readout: `target`, the state is moved to the time asked for; `last_row`, the prediction
             is decoded from the state after the row before (the thesis' protocol).
         init: `normal`, weights N(0, 0.1^2) and biases 0; `fan_in`, weights N(0, 1/fan-in), biases
             0, last layer of the vector field times 0.1.
@@ -277,7 +277,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A `TrainConfig` with every choice made: how a model is in fact trained.
+    """A `TrainConfig` with every choice made: how a model is trained.
 
     Attributes:
         epochs: as in `TrainConfig`, as are all others.

@@ -18,7 +18,7 @@ def writable(path: str | Path, *, folder: bool = False) -> Path:
     """Returns `path` if a file (or folder) can be written there; makes nothing yet.
 
     Raises:
-        InputError: something on the way is no folder or may not be written to, or a folder stands
+        InputError: something on the way is no folder or may not be written to, or there is a folder
             where a file is to be, or the other way round.
     """
     path = Path(path)
@@ -36,7 +36,7 @@ def writable(path: str | Path, *, folder: bool = False) -> Path:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yields a temporary file name beside `path`; renames it to `path` if the block succeeds.
 
-    A block that raises, or a process that is killed, leaves what stood at `path` untouched.
+    A block that raises, or a process that is killed, leaves what was at `path` untouched.
     """
     path = writable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yields a temporary folder beside `path`; renames it to `path` if the block succeeds.
 
-    A folder that stood at `path` is replaced, and only after the new one is complete.
+    A folder at `path` is replaced, and only after the new one is complete.
     """
     path = writable(path, folder=True)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""A training run: all of it that changes, and how it is kept in a folder and taken up again."""
+"""A training run: all of it that changes, how it is kept in a folder, and how it is resumed."""
 
 from __future__ import annotations
 
@@ -135,10 +135,10 @@ def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimize
 def identity_of(
     model: BaseModel, recipe: Recipe, train: Dataset, validation: Dataset | None
 ) -> dict[str, Any]:
-    """What must be the same for a run to go on: anything else would end in other numbers.
+    """What must be the same for a run to be resumed: anything else would end in other numbers.
 
     Args:
-        model: as it stands before the first step.
+        model: before the first step.
         recipe: of the training.
         train: the training set.
         validation: the validation set, or None.
@@ -194,7 +194,7 @@ def save_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str
 
     Args:
         folder: of the run.
-        model: as it stands.
+        model: in its present state.
         state: of its training.
         identity: from `identity_of`.
     """

@@ -83,7 +83,7 @@ def fit(
         validation: scored after each epoch.
         config: what it leaves open, or all of it if None, is the recipe of the model.
         out: folder for `log.csv`, checkpoints and the final `model`; a run that was stopped there
-            goes on where it was, and ends bit for bit as if it had not been stopped.
+            is resumed, and ends bit for bit as if it had not been stopped.
         device: such as `cpu` or `cuda`; by default where the model is. The model stays there.
         callbacks: each is called with the record of an epoch and the model after that epoch; a true
             result stops the training.
@@ -195,7 +195,7 @@ class ValidationSet:
         self.counted = empty.scores().after_first_observation.count
 
     def scores(self, model: BaseModel, *, seed: int = 0, gap_unit: float | None = None) -> Scores:
-        """Scores a model as it stands.
+        """Scores a model in its present state.
 
         Args:
             model: to score.
@@ -254,7 +254,7 @@ class Examples:
         """The model's loss of the one-step-ahead prediction of some trajectories.
 
         Args:
-            model: as it stands.
+            model: in its present state.
             index: (batch,) positions of the trajectories.
             generator: of self-feeding.
         """

@@ -173,7 +173,7 @@ def last_index(mask: Tensor) -> Tensor:
     Returns:
         (..., rows, channels) int64.
     """
-    if mask.shape[-2] == 1:  # a stream: nothing stands before its one row
+    if mask.shape[-2] == 1:  # a stream: nothing is before its one row
         return torch.full_like(mask, -1, dtype=torch.int64)
     rows = torch.arange(mask.shape[-2], device=mask.device)[:, None]
     latest = torch.where(mask, rows, -1).cummax(dim=-2).values
@@ -204,7 +204,7 @@ def last_values(values: Tensor, mask: Tensor, *, before: Tensor) -> Tensor:
     Args:
         values: (..., rows, channels).
         mask: (..., rows, channels) bool, True = observed.
-        before: broadcasts to (..., 1, channels); stands before the first observation.
+        before: broadcasts to (..., 1, channels); is used before the first observation.
 
     Returns:
         (..., rows, channels).

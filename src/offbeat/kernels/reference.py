@@ -114,7 +114,7 @@ class DecayAlongGap:
     Attributes:
         start: (batch, hidden) before the maximum, at the start of the gap.
         end: (batch, hidden) before the maximum, at its end.
-        applied: (batch, hidden) what of A the state already carries.
+        applied: (batch, hidden) the part of A that has already been applied to the state.
     """
 
     start: Tensor
@@ -289,7 +289,7 @@ def _exponent(a: Tensor) -> Tensor:
 
 
 def _growth(a: Tensor, applied: Tensor) -> Tensor:
-    """How far A has grown past what the state carries; never less than 0.
+    """How far A has grown past what has been applied to the state; never less than 0.
 
     A decay only ever shrinks: a state that the flow has meanwhile moved is not blown up again.
     """

@@ -202,7 +202,7 @@ class StepInputs:
         mean: (channels,) what a value decays to; with `input_decay` only.
         length: (batch,) int64, rows of each trajectory; later rows are padding and leave the state
             as it is. None: all rows count.
-        fed: one bool per row, True where the decoded state stands for the observed values; with
+        fed: one bool per row, True where the decoded state replaces the observed values; with
             self-feeding only.
     """
 
@@ -267,7 +267,7 @@ class StepTable:
         for name, value in given.items():
             if value is None:
                 continue
-            if id(value) not in known:  # one tensor may stand for two inputs
+            if id(value) not in known:  # one tensor can be two inputs
                 column = value if value.ndim == 3 else value[..., None]
                 known[id(value)] = slice(width, width + column.shape[2])
                 columns.append(column)

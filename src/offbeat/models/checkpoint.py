@@ -31,7 +31,7 @@ CONFIG = "config.json"
 
 
 def save_model(model: BaseModel, path: str | Path) -> None:
-    """Writes a model to a folder, atomically; one that stood there is replaced.
+    """Writes a model to a folder, atomically; an older one is replaced.
 
     Args:
         model: weights, config, statistics, scaler, channel names and units are all saved.
@@ -44,7 +44,7 @@ def load_model(path: str | Path) -> Any:
     """Reads a model back: the same predictions, bit for bit.
 
     Args:
-        path: the folder of a checkpoint, one of a training that goes on included, or of a run
+        path: the folder of a checkpoint, that of an unfinished training, or of a run
             that `fit` wrote.
 
     Returns:
@@ -78,10 +78,10 @@ def load_model(path: str | Path) -> Any:
 def save_training_state(
     model: BaseModel, tensors: dict[str, Tensor], record: dict[str, Any], path: str | Path
 ) -> None:
-    """Writes a model with all that its training needs to go on.
+    """Writes a model with all that its training needs to be resumed.
 
     Args:
-        model: as it stands.
+        model: in its present state.
         tensors: of the optimizer, and best weights.
         record: JSON-like counters and history.
         path: the folder.

@@ -1,4 +1,4 @@
-"""Times since observation and gaps at every row, and the state that goes on to the rows after them.
+"""Times since observation and gaps at every row, and the state that is kept for later rows.
 
 By default nothing moves before the first observation: the model's clock starts there. After it,
 time since the last observed row saturates at a limit, and a gap is the growth of that saturated
@@ -52,7 +52,7 @@ class RecurrentState:
 
         Args:
             state: (batch, state_size) the state before anything is observed.
-            mean: (channels,) stands for a value never observed.
+            mean: (channels,) in place of a value never observed.
             generator: of self-feeding.
         """
         batch, device = len(state), state.device
@@ -80,7 +80,7 @@ class ElapsedTimes:
     Attributes:
         observed: (batch, rows) bool, True where any channel is observed.
         first: (batch, rows) bool, True at the first observed row.
-        step: (batch, rows) since the row before, as it stands in the data.
+        step: (batch, rows) since the row before, in the data.
         gap: (batch, rows) growth of the saturated time since the last observed row.
         elapsed: (batch, rows) saturated time since the last observed row, on arrival at the row.
         elapsed_before: (batch, rows) the same at the row before, after its observation.

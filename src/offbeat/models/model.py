@@ -338,8 +338,8 @@ class Model(BaseModel):
             longest = self.statistics.longest_delta * float(self.config.gap_limit or 1)
             return (at_rows.delta.clamp_max(longest) / unit).to(self.dtype)
         if name in ("elapsed", "gap"):
-            age = at_rows.elapsed if name == "elapsed" else at_rows.step
-            return (age / unit).to(self.dtype)[..., None]
+            time = at_rows.elapsed if name == "elapsed" else at_rows.step
+            return (time / unit).to(self.dtype)[..., None]
         return None
 
 

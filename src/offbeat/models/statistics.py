@@ -17,11 +17,11 @@ class Statistics:
     """Measured on the training part, in scaled units and seconds.
 
     Attributes:
-        mean: per channel, over observed cells: the empirical mean of equation 27.
-        std: per channel, over observed cells; 1 where a channel never moves.
+        mean: per channel, over observed values: the empirical mean of equation 27.
+        std: per channel, over observed values; 1 where a channel never moves.
         median_gap: s, between consecutive rows.
         longest_elapsed: s, longest time from a row back to the last observed row.
-        longest_delta: s, longest age of any channel (equation 25).
+        longest_delta: s, longest time since observation of any channel (equation 25).
         rows: of the longest training trajectory; 0 in checkpoints of 0.1.
     """
 
@@ -62,13 +62,13 @@ class Statistics:
                 "every training trajectory has a single row; a model of motion needs at least one "
                 "trajectory of two rows"
             )
-        ages = [_longest(batch, mask.any(dim=2, keepdim=True)), _longest(batch, mask)]
+        longest = [_longest(batch, mask.any(dim=2, keepdim=True)), _longest(batch, mask)]
         return cls(
             tuple(mean.tolist()),
             tuple(std.tolist()),
             float(gaps.median()),
-            max(ages[0], float(gaps.median())),
-            max(*ages, float(gaps.median())),
+            max(longest[0], float(gaps.median())),
+            max(*longest, float(gaps.median())),
             batch.rows,
         )
 
@@ -89,6 +89,6 @@ def _longest(batch: Batch, mask: torch.Tensor) -> float:
     """Longest time from a valid row back to the last observation before it; 0 if there is none."""
     index = last_index(mask)
     times = batch.times[..., None].expand(index.shape)
-    age = times - times.gather(1, index.clamp_min(0))
-    age = age[(index >= 0) & batch.valid[..., None]]
-    return float(age.max()) if len(age) else 0.0
+    since = times - times.gather(1, index.clamp_min(0))
+    since = since[(index >= 0) & batch.valid[..., None]]
+    return float(since.max()) if len(since) else 0.0

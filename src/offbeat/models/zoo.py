@@ -103,7 +103,7 @@ class ModelEntry:
 
     Attributes:
         options: fields of `ModelConfig` that differ from the common choice.
-        recipe: fields of `TrainConfig` that the model is trained with unless told otherwise.
+        recipe: fields of `TrainConfig` that the model is trained with by default.
         factory: of a model of one's own: (data, **options) to a module; None for a composed one.
     """
 
@@ -200,7 +200,7 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
 
 
 def train_config(name: str, **options: Any) -> TrainConfig:
-    """The recipe of a model: how it is trained unless told otherwise, every field set.
+    """The recipe of a model: how it is trained by default, every field set.
 
     Args:
         name: of the model.

@@ -109,7 +109,7 @@ class Head(nn.Module):
         first = self.channels if self.anchored else 0
         return state[..., first : first + self.hidden_size]
 
-    def held(self, state: Tensor) -> Tensor:
+    def anchored_values(self, state: Tensor) -> Tensor:
         """(..., channels) the channels of an anchored state, in scaled units.
 
         Actions, where there are any, are decoded from the whole state.
@@ -142,7 +142,7 @@ class Point(Head):
     def decode(self, state: Tensor) -> Prediction:
         """(..., state_size) to a prediction of (..., channels)."""
         if self.decoder is None:
-            return Prediction(self.held(state))
+            return Prediction(self.anchored_values(state))
         return Prediction(perceptron(self.decoder.layers, self.hidden(state), "tanh"))
 
 
@@ -164,7 +164,7 @@ class Gaussian(Head):
         """(..., state_size) to means and standard deviations of (..., channels)."""
         decoded = perceptron(self.decoder.layers, self.hidden(state), "tanh")
         if self.anchored:
-            mean, raw = self.held(state), decoded
+            mean, raw = self.anchored_values(state), decoded
         else:
             mean, raw = decoded[..., : self.channels], decoded[..., self.channels :]
         return Prediction(mean, softplus(raw) * self.std + self.SMALLEST)
