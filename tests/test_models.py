@@ -919,7 +919,7 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
         ({"gap_limit": float("nan")}, "gap_limit must be at least 1"),
         ({"gap_limit": float("inf")}, "gap_limit must be"),
         ({"self_feeding": 1.5}, "self_feeding must be a fraction from 0 to 1"),
-        ({"self_feeding": "half"}, "self_feeding must be a share"),
+        ({"self_feeding": "half"}, "self_feeding must be a fraction"),
         ({"reset_after": "no"}, "reset_after must be"),
         ({"input_decay": 2}, "input_decay must be"),
         ({"anchored": "no"}, "anchored must be"),

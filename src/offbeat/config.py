@@ -40,7 +40,8 @@ class ModelConfig:
         atol: absolute tolerance of an adaptive solver, in units of the state.
         gradient: `backprop` through the solver's steps, or the `adjoint` method (algorithm 1).
         decay: `none`; `trainable`, the gamma_h of equation 26 from the times since observation of
-            all channels; `vector` or `scalar`, exp(-tau gap) with one tau per unit or one in all (equation 42).
+            all channels; `vector` or `scalar`, exp(-tau gap) with one tau per unit or one in all
+            (equation 42).
         decay_rows: `continuous`, the decay is a function of time alone, whatever rows it is asked
             at; `every_row`, gamma compounds at every row (the thesis' protocol);
             `observed_rows`, the state decays only where it is updated.
