@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import offbeat as ob
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 
 TIMES = np.array([0.0, 0.1, 0.3])
 VALUES = np.array([[1.0, 2.0], [np.nan, 3.0], [4.0, np.nan]])
@@ -154,7 +154,7 @@ def test_what_is_read_only_is_not_copied():
     part = one.slice(1, 3)
     assert np.shares_memory(part.values, one.values)
     assert np.shares_memory(part.times, one.times)
-    made = owned(np.zeros((2, 3, 2)))
+    made = hand_over(np.zeros((2, 3, 2)))
     assert np.shares_memory(ob.Trajectory(TIMES, made[0]).values, made)
     with pytest.raises(ValueError, match="read-only"):
         made[0] = 1

@@ -25,7 +25,7 @@ def frozen(value: Any, dtype: Any) -> NDArray[Any]:
     return array
 
 
-def owned(array: NDArray[Any]) -> NDArray[Any]:
+def hand_over(array: NDArray[Any]) -> NDArray[Any]:
     """Hands an array over to the records that are made from it, which then need no copy.
 
     The array, and those that it is a view of, become read-only. Call it last, on arrays that

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError, MissingExtraError, one_of
 
@@ -97,7 +97,7 @@ def from_pandas(
         tuple(
             Trajectory.from_arrays(
                 clock[index],
-                owned(values[index]),
+                hand_over(values[index]),
                 time_unit="ns" if nanoseconds else "s",
                 names=tuple(map(str, names)),
                 units=described[0],

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning.channels import find_repeats, new_values
 from offbeat.data.cleaning.log import sentences
 from offbeat.data.trajectory import Dataset
@@ -153,7 +153,7 @@ def without_repeats(dataset: Dataset) -> Dataset:
             for values in columns:
                 values[~new_values(values[:, c], found.rows_per_value), c] = np.nan
     trajectories = tuple(
-        replace(t, values=owned(v), observed=owned(t.observed & ~np.isnan(v)))
+        replace(t, values=hand_over(v), observed=hand_over(t.observed & ~np.isnan(v)))
         for t, v in zip(dataset, columns, strict=True)
     )
     return replace(dataset, trajectories=trajectories)

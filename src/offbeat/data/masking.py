@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.config import MASKS
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError, one_of
 
@@ -82,7 +82,7 @@ def mask_out(
             dropped = np.ones(trajectory.rows, dtype=bool)
             dropped[kept] = False
             observed[np.ix_(dropped, group)] = False
-        masked.append(replace(trajectory, observed=owned(observed)))
+        masked.append(replace(trajectory, observed=hand_over(observed)))
     meta: dict[str, Any] = {"observed_fraction": observed_fraction}
     if mask != "rows":
         meta["mask"] = mask

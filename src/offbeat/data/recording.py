@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning.anomalies import merge_rows
 from offbeat.data.cleaning.channels import find_repeats, make_continuous, new_values, unwrap
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
@@ -82,7 +82,7 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
             _resample(episode, options.resample_hz)
             _hold_actions(episode, channels)
     for episode in episodes:
-        owned(episode.values)
+        hand_over(episode.values)
     trajectories = tuple(episode.trajectory(channels, options) for episode in episodes)
     meta: dict[str, Any] = {"time_unit": unit}
     if labelled:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 from offbeat.data.robots import Control, Robot, channels_of, controls_of, load_model, robot_of
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import DivergenceError, InputError, require
@@ -91,8 +91,8 @@ def simulate(
         names, units = (*names, *controls_of(model)), (*units, *[""] * model.nu)
         roles = (*roles, *["action"] * model.nu)
     timestep = float(model.opt.timestep)
-    times = owned(np.arange(rows, dtype=np.float64) * timestep)
-    owned(values)
+    times = hand_over(np.arange(rows, dtype=np.float64) * timestep)
+    hand_over(values)
     return Dataset(
         tuple(
             Trajectory(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.arrays import owned
+from offbeat.data.arrays import hand_over
 from offbeat.data.memory import require_rows
 from offbeat.data.schema import METADATA_KEY, Schema
 from offbeat.data.source import require_file
@@ -145,15 +145,15 @@ def _data_set(table: Any, schema: Schema, path: Path) -> Dataset:
             f"schema says {schema.rows} rows of {schema.trajectories}, one after the other; it was "
             "changed after it was written, write it with save"
         )
-    times = owned(table.column("time").to_numpy())
+    times = hand_over(table.column("time").to_numpy())
     values = _matrix(table, schema.stored_as)
     observed = None
     if schema.observed:
         observed = ~np.isnan(values)
         for name, column in zip(schema.observed, schema.observed_columns, strict=True):
             observed[:, schema.names.index(name)] = table.column(column).to_numpy()
-        owned(observed)
-    owned(values)
+        hand_over(observed)
+    hand_over(values)
     ends = [*starts[1:], len(number)]
     names, units, roles = tuple(schema.names), tuple(schema.units), tuple(schema.roles)
     try:

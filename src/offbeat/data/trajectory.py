@@ -11,7 +11,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.data.arrays import frozen, owned
+from offbeat.data.arrays import frozen, hand_over
 from offbeat.errors import InputError, one_of
 
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
@@ -81,7 +81,7 @@ class Trajectory:
         known = np.isnan(values)
         np.logical_not(known, out=known)
         if self.observed is None:
-            observed = owned(known)
+            observed = hand_over(known)
         else:
             observed = np.asarray(self.observed)
             if observed.dtype != np.bool_ or observed.shape != values.shape:
@@ -176,8 +176,8 @@ class Trajectory:
         order = list(index)
         return replace(
             self,
-            values=owned(self.values[:, order]),
-            observed=owned(self.observed[:, order]),
+            values=hand_over(self.values[:, order]),
+            observed=hand_over(self.observed[:, order]),
             names=tuple(self.names[i] for i in order),
             units=tuple(self.units[i] for i in order),
             roles=tuple(self.roles[i] for i in order),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.arrays import owned as hand_over
+from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning import anomalies
 from offbeat.data.cleaning.channels import find_quaternions
 from offbeat.data.cleaning.log import CleaningLog
