@@ -22,7 +22,9 @@ struct Scan {
 #include "affine.hpp"
 #include "layout.hpp"
 #include "forward.hpp"
+#include "weight_gradients.hpp"
 #include "backward.hpp"
+#include "cells.hpp"
 #include "perceptron.hpp"
 #include "stream.hpp"
 };
