@@ -170,6 +170,8 @@ class CommandParser(ArgumentParser):
             known = [name for name in self._option_string_actions if "=" not in name]
             near = difflib.get_close_matches(f"--{unknown[1]}", known, n=1, cutoff=0.7)
             message += f"; did you mean {near[0]!r}?" if near else ""
+        elif re.search("unrecognized arguments: [^-]", message, re.IGNORECASE):
+            message += "; all paths stand together" if "together" not in message else ""
         message = message.replace(
             "ignored explicit argument", "stands alone, or takes =true or =false, not"
         )
