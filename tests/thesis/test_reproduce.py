@@ -380,7 +380,7 @@ def test_a_record_that_is_not_there_is_an_error(tmp_path, here):
 def test_a_damaged_record_says_what_to_do(done, tmp_path, here):
     out = copied(done, tmp_path)
     (out / "record.parquet").write_bytes((out / "record.parquet").read_bytes()[:-100])
-    with pytest.raises(ob.FileFormatError, match=r"record.parquet is damaged .*remove it"):
+    with pytest.raises(ob.FileFormatError, match=r"record.parquet cannot be read .*remove it"):
         reproduce(SMALL, out, progress=False)
     (out / "record.parquet").unlink()
     assert reproduce(SMALL, out, progress=False).record == Record.read(done)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ _NEW = {
 }
 
 _CONDITION = ("condition", "data", "experiment", "observed_fraction")
+_TEXT = ("run_id", "model", "condition", "data", "repeat", *PROVENANCE, "kernel_body")
 _NOT_SETTINGS = ("seed", "checkpoint_every")
 
 
@@ -162,7 +163,10 @@ def _mse(score: Mapping[str, Any]) -> float:
 
 
 def _read_table(path: Path) -> list[RawRun]:
-    rows = [{_NEW.get(name, name): value for name, value in row.items()} for row in _rows(path)]
+    rows = [
+        {_NEW.get(name, name): value for name, value in row.items()}
+        for row in read_rows(path, _TEXT)
+    ]
     columns = set(rows[0]) if rows else set()
     metrics = [metric for metric in METRICS if f"{metric}_mse" in columns]
     missing = [name for name in ("model", "repeat") if name not in columns]
@@ -200,15 +204,25 @@ def _read_table(path: Path) -> list[RawRun]:
     return found
 
 
-def _rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path, text: Iterable[str]) -> list[dict[str, Any]]:
+    """The rows of a table as they stand in its file.
+
+    Args:
+        path: .parquet or .csv.
+        text: columns that hold texts; the types of the others are found in a CSV file.
+
+    Raises:
+        FileFormatError: the file is damaged.
+    """
     import pyarrow as pa
     import pyarrow.csv
     import pyarrow.parquet
 
-    text = ("run_id", "model", "condition", "data", "repeat", *PROVENANCE, "kernel_body")
     try:
         if path.suffix.lower() == ".parquet":
-            table = pyarrow.parquet.read_table(path, memory_map=False)
+            table = pyarrow.parquet.read_table(
+                path, page_checksum_verification=True, memory_map=False
+            )
         else:
             options = pyarrow.csv.ConvertOptions(
                 column_types={name: pa.string() for name in text}, strings_can_be_null=True

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from offbeat.comparison.run_files import read_rows
 from offbeat.errors import FileFormatError
 from offbeat.files import atomic_path, write_text
 
@@ -121,7 +122,7 @@ class Record:
         columns = {there: cls.CURVE_COLUMNS[name] for name, there in cls.LOG_COLUMNS.items()}
         return tuple(
             {"run_id": run_id} | {name: line[there] for name, there in cls.LOG_COLUMNS.items()}
-            for line in _typed_lines(log, columns)
+            for line in _typed_rows(log, columns)
         )
 
     def write(self, folder: str | Path) -> None:
@@ -198,47 +199,32 @@ def _write_table(path: Path, columns: Mapping[str, type], rows: Iterable[Row]) -
 
 
 def _read_table(path: Path, columns: Mapping[str, type]) -> list[dict[str, Any]]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    path = path.with_suffix(".parquet")
-    if not path.is_file():
-        path = path.with_suffix(".csv")
-        return _typed_lines(path, columns) if path.is_file() else []
-    try:
-        table = pq.read_table(path, page_checksum_verification=True, memory_map=False)
-    except (pa.ArrowException, OSError) as error:
-        raise FileFormatError(
-            f"{path} is damaged ({' '.join(str(error).split())}); remove it: the CSV beside it "
-            "holds the same"
-        ) from None
-    _check_columns(path, table.column_names, columns)
-    rows: list[dict[str, Any]] = table.select(list(columns)).to_pylist()
-    return rows
+    for suffix, other in ((".parquet", ".csv"), (".csv", ".parquet")):
+        file = path.with_suffix(suffix)
+        if file.is_file():
+            try:
+                return _typed_rows(file, columns)
+            except FileFormatError as error:
+                raise FileFormatError(
+                    f"{error}; remove it: {path.name}{other} beside it, if there is one, holds the "
+                    "same"
+                ) from None
+    return []
 
 
-def _typed_lines(path: Path, columns: Mapping[str, type]) -> list[dict[str, Any]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        _check_columns(path, reader.fieldnames or (), columns)
-        try:
-            return [
-                {
-                    key: math.nan if kind is float and not line[key] else kind(line[key])
-                    for key, kind in columns.items()
-                }
-                for line in reader
-            ]
-        except (TypeError, ValueError) as error:
-            raise FileFormatError(
-                f"{path} is damaged at line {reader.line_num} ({error}); restore it, or remove it"
-            ) from None
-
-
-def _check_columns(path: Path, got: Iterable[str], columns: Mapping[str, type]) -> None:
-    missing = columns.keys() - set(got)
+def _typed_rows(path: Path, columns: Mapping[str, type]) -> list[dict[str, Any]]:
+    rows = read_rows(path, [name for name, kind in columns.items() if kind is str])
+    missing = columns.keys() - set(rows[0]) if rows else set()
     if missing:
-        raise FileFormatError(
-            f"{path} lacks the columns {', '.join(sorted(missing))}; give the record of a sweep "
-            "that this version wrote"
-        )
+        raise FileFormatError(f"{path} lacks the columns {', '.join(sorted(missing))}")
+    empty: dict[type, Any] = {float: math.nan, str: ""}
+    try:
+        return [
+            {
+                name: kind(empty[kind] if row[name] is None else row[name])
+                for name, kind in columns.items()
+            }
+            for row in rows
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path} is damaged: {error!r}") from None
