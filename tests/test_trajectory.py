@@ -158,3 +158,20 @@ def test_what_is_read_only_is_not_copied():
     assert np.shares_memory(ob.Trajectory(TIMES, made[0]).values, made)
     with pytest.raises(ValueError, match="read-only"):
         made[0] = 1
+
+
+def test_a_model_of_states_takes_data_that_have_actions_too():
+    data = ob.Dataset((ob.Trajectory(TIMES, VALUES, names=("a", "b")),))
+    acted = ob.Trajectory(
+        TIMES,
+        np.column_stack([np.ones(3), VALUES]),
+        names=("u", "a", "b"),
+        roles=("action", "state", "state"),
+    )
+    assert ob.Dataset((acted,)).without_actions_but(("a",)).fingerprint() == data.fingerprint()
+    assert ob.Dataset((acted,)).without_actions_but(("u",)).channels == 3
+    model = ob.make_model("gru", data, hidden_size=2)
+    expected, got = ob.predict(model, data), ob.predict(model, ob.Dataset((acted,)))
+    assert np.array_equal(got[0].values, expected[0].values)
+    filled, again = ob.impute(model, data), ob.impute(model, ob.Dataset((acted,)))
+    assert np.array_equal(filled[0].values, again[0].values)

@@ -85,7 +85,11 @@ def predict(
 
 
 def in_model_order(model: BaseModel, dataset: Dataset) -> Dataset:
-    """The data set with its channels in the order of the model; as it is where they differ."""
+    """The data set with its channels in the order of the model; as it is where they differ.
+
+    Actions that the model does not know are left out.
+    """
+    dataset = dataset.without_actions_but(model.names)
     same = set(dataset.names) == set(model.names)
     return dataset.select(model.names) if same and dataset.names != model.names else dataset
 

@@ -303,9 +303,7 @@ class Dataset(Sequence[Trajectory]):
         """
         described, dataset = json.dumps([self.names, self.units, self.roles]), self
         if version == 1:
-            dataset = self.select(
-                [n for n, r in zip(self.names, self.roles, strict=True) if r != "action"]
-            )
+            dataset = self.without_actions_but(())
             described = "\0".join(dataset.names)
         digest = hashlib.sha256(described.encode())
         for trajectory in dataset:
@@ -321,6 +319,15 @@ class Dataset(Sequence[Trajectory]):
         """
         order = [self.names.index(one_of("channel", name, self.names)) for name in names]
         return replace(self, trajectories=tuple(t.select(order) for t in self))
+
+    def without_actions_but(self, names: Sequence[str]) -> Dataset:
+        """The data set without the actions that are not among these channels."""
+        kept = [
+            name
+            for name, role in zip(self.names, self.roles, strict=True)
+            if role != "action" or name in names
+        ]
+        return self if len(kept) in (0, self.channels) else self.select(kept)
 
     def __repr__(self) -> str:
         rows = sum(t.rows for t in self)

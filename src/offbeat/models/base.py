@@ -97,12 +97,15 @@ class BaseModel(nn.Module):
     def batch(self, dataset: Dataset) -> Batch:
         """Transforms, scales and pads a data set of this model's channels, in any order.
 
+        Actions that the model does not know are left out.
+
         Returns:
             The batch, on the model's device.
 
         Raises:
             InputError: channels differ from the model's, or their units where the data has any.
         """
+        dataset = dataset.without_actions_but(self.names)
         own = dict(zip(self.names, self.units, strict=True))
         given = dict(zip(dataset.names, dataset.units, strict=True))
         agree = own.keys() == given.keys() and all(
