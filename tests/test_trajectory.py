@@ -147,6 +147,11 @@ def test_a_trajectory_owns_its_arrays():
     aliased = ob.Trajectory(TIMES, view)
     backing[:] = np.inf
     assert aliased.values[0, 0] == 1.0
+    buffer = bytearray(VALUES.tobytes())
+    seen = np.frombuffer(memoryview(buffer).toreadonly()).reshape(3, 2)
+    aliased = ob.Trajectory(TIMES, seen)
+    buffer[:8] = np.array([np.inf]).tobytes()
+    assert aliased.values[0, 0] == 1.0
 
 
 def test_what_is_read_only_is_not_copied():

@@ -44,4 +44,4 @@ def _is_frozen(array: NDArray[Any]) -> bool:
         if part.flags.writeable:
             return False
         part = part.base
-    return True
+    return part is None or isinstance(part, bytes)

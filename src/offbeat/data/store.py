@@ -145,7 +145,7 @@ def _data_set(table: Any, schema: Schema, path: Path) -> Dataset:
             f"schema says {schema.rows} rows of {schema.trajectories}, one after the other; it was "
             "changed after it was written, write it with save"
         )
-    times = hand_over(table.column("time").to_numpy())
+    times = hand_over(np.array(table.column("time").to_numpy()))
     values = _matrix(table, schema.stored_as)
     observed = None
     if schema.observed:
