@@ -1,7 +1,7 @@
 """The places of the numbers in a serialised ROS message, and decoding thousands of them at once.
 
 Messages of one topic mostly have one layout: the same length, the same lengths of strings and
-sequences. So a layout is found once, by walking along one message, and all messages that agree with
+sequences. So a layout is found once, by parsing one message, and all messages that agree with
 it in these lengths are decoded together, as columns of one table of bytes. Nothing is done per
 message in Python, and what is not asked for is never decoded.
 
@@ -181,32 +181,32 @@ def find_layout(
     Raises:
         FileFormatError: the message does not fit the definition, or a type is not known.
     """
-    walk = _Walk(message, definitions, cdr=cdr, wanted=wanted)
+    parser = _Parser(message, definitions, cdr=cdr, wanted=wanted)
     try:
-        walk.message(kind, "", Row(), "")
+        parser.message(kind, "", Row(), "")
     except (struct.error, UnicodeDecodeError) as error:
         raise FileFormatError(
             f"a message of type {kind} is cut short or damaged ({error})"
         ) from None
-    rest = len(message) - walk.base - walk.position
+    rest = len(message) - parser.base - parser.position
     if rest < 0 or rest > (3 if cdr else 0):
         raise FileFormatError(
             f"a message of {len(message)} bytes does not fit the definition of {kind}, which "
-            f"takes {walk.base + walk.position}"
+            f"takes {parser.base + parser.position}"
         )
-    places = np.array(sorted(walk.agreed), dtype=np.intp)
+    places = np.array(sorted(parser.agreed), dtype=np.intp)
     return Layout(
         places,
         np.frombuffer(message, np.uint8)[places],
-        walk.order,
-        tuple(row for row in walk.rows if row.columns),
-        walk.skipped,
-        tuple(dict.fromkeys(walk.available)),
+        parser.order,
+        tuple(row for row in parser.rows if row.columns),
+        parser.skipped,
+        tuple(dict.fromkeys(parser.available)),
     )
 
 
-class _Walk:
-    """A walk along one message; `position` counts from the start of its fields."""
+class _Parser:
+    """Parses one message; `position` counts from the start of its fields."""
 
     def __init__(
         self,
@@ -303,7 +303,7 @@ class _Walk:
             self.skipped.setdefault(here, "a list of messages")
 
     def _child(self, row: Row) -> str:
-        """The child frame of the transform that was just walked along; its bytes must agree."""
+        """The child frame of the transform that was just parsed; its bytes must agree."""
         start, stop = self.last_text
         self.agreed.update(range(start, stop))
         return self.raw[start:stop].rstrip(b"\0").decode()
