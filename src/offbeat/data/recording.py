@@ -17,8 +17,9 @@ from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning.anomalies import merge_rows
 from offbeat.data.cleaning.channels import find_repeats, make_continuous, new_values, unwrap
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
+from offbeat.data.cleaning.described import Channels
 from offbeat.data.cleaning.log import CleaningLog
-from offbeat.data.cleaning.merging import Channels, Episode, cut
+from offbeat.data.cleaning.merging import Episode, cut
 from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
 from offbeat.data.signals import Recording as Recording
 from offbeat.data.signals import Signal as Signal

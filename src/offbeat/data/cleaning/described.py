@@ -1,0 +1,110 @@
+"""Names, units, roles and kinds of the channels of all recordings together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from offbeat.data.cleaning.channels import find_quaternions
+from offbeat.data.cleaning.options import ReaderOptions
+from offbeat.data.signals import Recording, Signal
+from offbeat.data.transforms import full_turn
+from offbeat.errors import FileFormatError, InputError, one_of
+
+
+@dataclass(frozen=True)
+class Channels:
+    """The channels of all recordings together, in the order in which they were first met."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    roles: tuple[str, ...]
+    columns: dict[tuple[str, str], int]  # by signal and channel
+    angles: dict[int, float]  # the full turn of each, in its unit
+    quaternions: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, recordings: list[Recording], options: ReaderOptions) -> Channels:
+        """Collects the channels, and finds quaternions that no reader marked.
+
+        Raises:
+            FileFormatError: there is no channel, names repeat, or units disagree.
+            InputError: `channels`, `without` or `angles` names a channel that there is not.
+        """
+        if not recordings:
+            raise FileFormatError("there is nothing recorded to read; check the file")
+        columns: dict[tuple[str, str], int] = {}
+        units: list[str] = []
+        kinds: list[str] = []
+        roles: list[str] = []
+        looked_at: set[str] = set()
+        for signal in (signal for recording in recordings for signal in recording.signals):
+            for channel, unit, kind, role in zip(
+                signal.channels, signal.units, signal.kinds, signal.roles, strict=True
+            ):
+                at = columns.setdefault((signal.name, channel), len(columns))
+                if at == len(units):
+                    units.append(unit)
+                    kinds.append(kind)
+                    roles.append(role)
+                units[at] = units[at] or unit
+                kinds[at] = kinds[at] or kind
+                if unit not in ("", units[at]):
+                    raise FileFormatError(
+                        f"channel {channel!r} of signal {signal.name!r} is in {units[at]!r} here "
+                        f"and in {unit!r} there; read the recordings one by one"
+                    )
+            if len(signal.stamps) and signal.name not in looked_at:
+                looked_at.add(signal.name)
+                if "quaternion" not in signal.kinds:
+                    for first in find_quaternions(signal.channels, signal.values.T):
+                        for channel in signal.channels[first : first + 4]:
+                            kinds[columns[signal.name, channel]] = "quaternion"
+        several = len({signal for signal, _ in columns}) > 1
+        names = tuple(f"{s}.{c}" if several and s else c for s, c in columns)
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise FileFormatError(f"two channels have the name {twice!r}; names must be unique")
+        if not names:
+            raise FileFormatError("there is no channel to read, only times")
+        for option, role in (("actions", "action"), ("exogenous", "exogenous")):
+            for name in getattr(options, option):
+                roles[names.index(one_of(f"channel in {option}", name, names))] = role
+        for name in options.angles:
+            kinds[names.index(one_of("channel in angles", name, names))] = "angle"
+        left_out = {one_of("channel in without", name, names) for name in options.without}
+        chosen = tuple(name for name in options.channels or names if name not in left_out)
+        if not chosen:
+            raise InputError(f"there are no channels but those to be left out: {', '.join(names)}")
+        kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
+        fours = [at for at, kind in enumerate(kinds) if kind == "quaternion"]
+        whole = [fours[i : i + 4] for i in range(0, len(fours), 4)]
+        return cls(
+            chosen,
+            tuple(units[at] for at in kept),
+            tuple(roles[at] for at in kept),
+            {key: kept[at] for key, at in columns.items() if at in kept},
+            {
+                kept[at]: full_turn(units[at])
+                for at, kind in enumerate(kinds)
+                if kind == "angle" and at in kept
+            },
+            tuple(
+                tuple(kept[at] for at in four)
+                for four in whole
+                if options.quaternions == "continuous"
+                and all(at in kept and roles[at] != "action" for at in four)
+            ),
+        )
+
+    def keep(self, signal: Signal) -> Signal | None:
+        """The signal with those of its channels that are kept, or None."""
+        at = [i for i, name in enumerate(signal.channels) if (signal.name, name) in self.columns]
+        if len(at) == len(signal.channels):
+            return signal
+        names = tuple(signal.channels[i] for i in at)
+        return Signal(signal.name, signal.stamps, signal.values[:, at], names) if at else None
+
+    def names_of(self, columns: Iterable[int]) -> tuple[str, ...]:
+        """The names of some columns."""
+        return tuple(self.names[c] for c in columns)
