@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import record_helpers as made
 
 from offbeat.errors import InputError
 from thesis.__main__ import main as thesis_main
+from thesis.protocol import Protocol
 from thesis.report import circumstances, convergence, findings
 from thesis.report import thesis_numbers as thesis
 from thesis.report.circumstances import Circumstances
@@ -311,3 +313,13 @@ def test_the_command_writes_the_document_where_it_is_told(tmp_path, capsys):
     assert not (tmp_path / "out" / "summary.md").exists()
     with pytest.raises(InputError, match="give the name of a file"):
         write_report(two, tmp_path / "out", summary=tmp_path)
+
+
+def test_what_is_published_names_no_folder_of_a_machine():
+    root = Path(__file__).parents[2]
+    about = json.loads((root / "results/thesis/about.json").read_text(encoding="utf-8"))
+    assert not [word for line in about["commands"] for word in line if word.startswith("/")]
+    assert about["runs_done"] == about["runs_total"] == len(Protocol().runs())
+    document = (root / "docs/reproduction.md").read_text(encoding="utf-8")
+    assert "**376 of 376 runs.**" in document
+    assert not re.search(r"--?\w+[ =]/", document)

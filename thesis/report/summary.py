@@ -321,6 +321,8 @@ def _made(contents: Contents) -> Iterable[str]:
     yield "## How it was made"
     typed = circumstances.commands or (REPRODUCE,)
     yield "```\n" + "\n".join(dict.fromkeys((*typed, DOCUMENT))) + "\n```"
+    if any(line.startswith("offbeat reproduce") for line in typed):
+        yield "`offbeat reproduce` is the name that `python -m thesis run` had in version 0.1.0."
     yield (
         "One run again: `python -m thesis run --out runs/again --only "
         "experiment=2,model=ode_rnn,fraction=0.3,repeat=0`; its seeds are in the record "
