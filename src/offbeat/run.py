@@ -154,11 +154,12 @@ def identity_of(
     identity: dict[str, Any] = {
         "model": {"name": model.name, **options},
         "training": asdict(recipe),
+        "train": _part(train),
+        "validation": None if validation is None else _part(validation),
+        # These follow from the training set unless they were given.
         "scaler": model.scaler.to_dict(),
         "statistics": model.statistics.to_dict(),
         "initial_weights": weights.hexdigest(),
-        "train": _part(train),
-        "validation": None if validation is None else _part(validation),
     }
     if recipe.schedule == "constant":
         identity["training"].pop("epochs")  # such a run can be trained for longer
@@ -248,6 +249,11 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
             )
         return
     weights, tensors, kept = load_training_state(checkpoints[-1])
+    if "fingerprint" not in kept["identity"]["train"]:
+        raise InputError(
+            f"{folder} holds a run of Offbeat 0.1, whose checkpoints do not say on which data; its "
+            "model can be used, but the run can't be resumed: give another folder"
+        )
     for part, now in identity.items():
         then = kept["identity"].get(part)
         if then != now:

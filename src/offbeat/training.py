@@ -100,7 +100,6 @@ def fit(
     asked = config or TrainConfig()
     if validation is None and (asked.patience is not None or asked.keep == "best"):
         raise InputError("patience and keep='best' need a validation set; got none")
-    recipe = recipe_of(model.name, asked, validated=validation is not None)
     folder = writable(out, folder=True) if out is not None else None
     if device is not None:
         model.to(_device(device))
@@ -108,11 +107,13 @@ def fit(
     validated = None
     if validation is not None:
         validated = ValidationSet(model, model.batch(validation))
-        if not validated.counted and (recipe.patience is not None or asked.keep == "best"):
-            raise InputError(
-                "no value of the validation set counts: none is known after its channel's first "
-                "observation; give a longer validation set, or keep='last' and no patience"
-            )
+    counts = validated is not None and validated.counted > 0
+    recipe = recipe_of(model.name, asked, validated=counts)
+    if not counts and (recipe.patience is not None or recipe.keep == "best"):
+        raise InputError(
+            "no value of the validation set counts: none is known after its channel's first "
+            "observation; give a longer validation set, or keep='last' and no patience"
+        )
     with flat_parameters(model) as parameters, model.threads():
         state = RunState(parameters, recipe)
         identity: dict[str, Any] = {}

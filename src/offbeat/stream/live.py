@@ -211,7 +211,7 @@ class LiveStream:
         if not isinstance(record, dict) or record.get("format") != FORMAT:
             raise InputError(f"this is no record of a stream (it has no format {FORMAT!r})")
         for key, expected, fix in (
-            ("version", VERSION, "use the Offbeat that wrote it, or a newer one"),
+            ("version", VERSION, "use the version of Offbeat that wrote it"),
             ("model", self._engine.fingerprint(), "restore it with the model that wrote it"),
             ("time_unit", self.time_unit, "give this stream the time unit of the record"),
         ):
