@@ -73,10 +73,10 @@ class Problem(NamedTuple):
         old = self.weights
         cell: Any = copy.copy(old.cell)
         if cell is not None:
-            cell._parameters = {}
-            for name in ("inputs", "bias", "recurrent", "recurrent_bias", "innovation"):
-                value = getattr(old.cell, name)
-                object.__setattr__(cell, name, None if value is None else left.pop(0))
+            cell._parameters = {
+                name: None if value is None else left.pop(0)
+                for name, value in cell._parameters.items()
+            }
         decay = None if old.decay is None else pairs([0])[0]
         input_decay = None if old.input_decay is None else pairs([0])[0]
         field: Any = None

@@ -261,7 +261,8 @@ class Examples:
         """
         index = index.to(self.targets.device)
         whole = model.run(self.prepared.take(index), generator=generator)
-        prediction = Prediction(whole.mean, whole.scale).map(lambda tensor: tensor[:, 1:])
+        scale = None if whole.scale is None else whole.scale[:, 1:]
+        prediction = Prediction(whole.mean[:, 1:], scale)
         rows = prediction.mean.shape[1]
         targets = self.targets.index_select(0, index)[:, :rows]
         mask = None

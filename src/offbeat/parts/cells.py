@@ -82,12 +82,14 @@ class Cell(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} must define new or step")
 
     def tensors(self) -> Iterator[Tensor]:
-        """All trained tensors, in the order of the packed buffer."""
-        named = ("inputs", "bias", "recurrent", "recurrent_bias", "innovation")
-        own = [getattr(self, name) for name in named]
-        yield from (tensor for tensor in own if tensor is not None)
-        known = {id(tensor) for tensor in own}
-        yield from (p for p in self.parameters() if id(p) not in known)
+        """All trained tensors: those of the base class in the order of its attributes, then others.
+
+        It is called several times per training step, so it does not walk the module's tree.
+        """
+        yield from (tensor for tensor in self._parameters.values() if tensor is not None)
+        for child in self._modules.values():
+            if child is not None:
+                yield from child.parameters()
 
     def _recurrent(self) -> Tensor:
         assert self.recurrent is not None

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -26,11 +25,6 @@ class Prediction:
 
     mean: Tensor
     scale: Tensor | None = None
-
-    def map(self, function: Any) -> Prediction:
-        """The same prediction with `function` applied to each of its tensors."""
-        scale = None if self.scale is None else function(self.scale)
-        return replace(self, mean=function(self.mean), scale=scale)
 
 
 @dataclass(frozen=True, eq=False)
