@@ -3,8 +3,10 @@
 import importlib.metadata
 
 import pytest
+from torch import nn
 
 from offbeat.errors import InputError
+from offbeat.models.zoo import MODELS, ModelEntry
 from offbeat.registry import Registry
 
 
@@ -68,3 +70,19 @@ def test_an_entry_point_that_fails_costs_a_warning_and_nothing_else(monkeypatch)
     shapes.register("square", 4)
     with pytest.warns(UserWarning, match=r"shape 'broken'.*no module named shapes"):
         assert list(shapes) == ["square"]
+
+
+def test_an_entry_point_of_a_module_is_a_model_and_of_anything_else_costs_a_warning(monkeypatch):
+    class Point:
+        def __init__(self, name, found):
+            self.name, self.value, self.found = name, f"mine:{name}", found
+
+        def load(self):
+            return self.found
+
+    points = [Point("module", nn.Linear), Point("number", 3)]
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: points)
+    models: Registry[ModelEntry] = Registry("model", group="offbeat.models", adopt=MODELS._adopt)
+    with pytest.warns(UserWarning, match=r"model 'number'.*expected a subclass of torch.nn.Module"):
+        assert list(models) == ["module"]
+    assert models["module"].factory is nn.Linear

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import warnings
-from collections.abc import Iterator, Mapping
-from typing import Generic, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
 
 from offbeat.errors import InputError, one_of
 
@@ -22,6 +22,7 @@ class Registry(Mapping[str, T], Generic[T]):
     Args:
         what: what an entry is, for messages: `cell`, `reader`.
         group: of entry points, such as `offbeat.models`; None for a registry without.
+        adopt: makes an entry of what an entry point gives, or raises; by default it is one.
 
     Example:
         >>> CELLS: Registry[type] = Registry("cell")
@@ -29,8 +30,14 @@ class Registry(Mapping[str, T], Generic[T]):
         <class 'object'>
     """
 
-    def __init__(self, what: str, *, group: str | None = None) -> None:
-        self.what, self.group = what, group
+    def __init__(
+        self,
+        what: str,
+        *,
+        group: str | None = None,
+        adopt: Callable[[Any], T] | None = None,
+    ) -> None:
+        self.what, self.group, self._adopt = what, group, adopt
         self._entries: dict[str, T] = {}
         self._loaded = group is None
 
@@ -94,6 +101,8 @@ class Registry(Mapping[str, T], Generic[T]):
             try:
                 entry = point.load()
                 made = entry() if callable(entry) and not isinstance(entry, type) else entry
+                if made is not None and self._adopt is not None:
+                    made = self._adopt(made)
             except Exception as error:  # another package's code must not stop this one
                 warnings.warn(
                     f"the {self.what} {point.name!r} ({point.value}) of another package cannot be "

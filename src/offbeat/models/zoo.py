@@ -112,7 +112,16 @@ class ModelEntry:
     factory: Callable[..., nn.Module] | None = None
 
 
-MODELS: Registry[ModelEntry] = Registry("model", group="offbeat.models")
+def _adopt(found: Any) -> ModelEntry:
+    """The entry of what an entry point of another package gives."""
+    if isinstance(found, ModelEntry):
+        return found
+    if isinstance(found, type) and issubclass(found, nn.Module):
+        return ModelEntry({}, _FOREIGN_RECIPE, found)
+    raise TypeError("expected a subclass of torch.nn.Module, or a function that registers one")
+
+
+MODELS: Registry[ModelEntry] = Registry("model", group="offbeat.models", adopt=_adopt)
 """Models by the name that `make_model` takes."""
 
 for _name, _options in ZOO.items():
