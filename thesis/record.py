@@ -71,7 +71,7 @@ LOG_COLUMNS: dict[str, str] = {
 """Columns of the table of curves, each with its name in the `log.csv` of a training."""
 
 GROUP = ("bits", "cpu", "kernel_body", "torch", "data")
-"""Runs that agree in these were made alike; those that do not are never mixed in silence."""
+"""Runs that agree in these were made alike; those that do not are never mixed without a mark."""
 
 
 class Record(record.Record):

@@ -1,4 +1,4 @@
-"""What holds and what does not: sentences made of test results, none of them written beforehand."""
+"""What holds and what does not: sentences made of test results, none of them written by hand."""
 
 from __future__ import annotations
 

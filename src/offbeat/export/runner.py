@@ -109,7 +109,7 @@ class OnnxEngine(Engine):
         self._slots = [{}] * slots
 
     def reset(self) -> None:
-        """Begins anew."""
+        """Starts again."""
         self._state = dict(self._initial)
 
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:

@@ -190,7 +190,7 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
 
     Predictions are read from the last row, the state moves from the first row on, gamma_h compounds
     at every row of the grid, a plain GRU is given the gap since the row before, and self-feeding,
-    where it is on, leaves h undecayed at hidden rows.
+    where it is on, leaves h undecayed at masked rows.
 
     Args:
         name: `gru`, `gru_d`, `ode_rnn` or `ode_gru_d`.

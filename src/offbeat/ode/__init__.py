@@ -64,9 +64,9 @@ def solve(
         return solve_fixed(field, y, duration, tableau, steps, most_steps)
     check_problem(y, duration)
 
-    def walk(field: Field, y: Tensor, duration: Tensor, *, reuse: bool = True) -> Steps:
+    def take_steps(field: Field, y: Tensor, duration: Tensor, *, reuse: bool = True) -> Steps:
         if tableau.adaptive:
             return adaptive_steps(field, y, duration, tableau, rtol=rtol, atol=atol, reuse=reuse)
         return fixed_steps(field, y, duration, tableau, steps, most_steps, reuse=reuse)
 
-    return solve_adjoint(field, y, duration, walk, tableau.b, adjoint_parameters)
+    return solve_adjoint(field, y, duration, take_steps, tableau.b, adjoint_parameters)

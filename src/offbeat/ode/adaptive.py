@@ -20,7 +20,7 @@ _LEAST_ERROR = 1e-10
 _LEAST_PREVIOUS = 1e-4
 """Errors below these count as these, so that one lucky step doesn't upset the controller."""
 _SNAP = 1e-2
-"""A step that would leave less than this share of itself takes the rest of the gap along."""
+"""A step that would leave less than this fraction of itself takes the rest of the gap along."""
 
 
 def solve_adaptive(

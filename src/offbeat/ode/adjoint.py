@@ -14,7 +14,7 @@ from offbeat.errors import DivergenceError
 from offbeat.ode.fixed import Field, Steps
 
 
-class Walk(Protocol):
+class TakeSteps(Protocol):
     """Takes the steps of a solver: `fixed_steps` or `adaptive_steps`, its options bound."""
 
     def __call__(self, field: Field, y: Tensor, duration: Tensor, *, reuse: bool = True) -> Steps:
@@ -26,7 +26,7 @@ def solve_adjoint(
     field: Field,
     y: Tensor,
     duration: Tensor,
-    walk: Walk,
+    take_steps: TakeSteps,
     weights: tuple[float, ...],
     parameters: Sequence[Tensor],
 ) -> Tensor:
@@ -51,7 +51,7 @@ def solve_adjoint(
         field: see `Field`; it is evaluated again on the way back, so it must not change.
         y: (batch, size) states at the start of the gaps.
         duration: (batch, 1) gap of each row.
-        walk: takes the steps.
+        take_steps: takes the steps.
         weights: of the stages of a step, as in `Tableau.b`.
         parameters: the tensors that the field closes over, leaves or not, shared by the rows or
             with a row per row. These, `y` and `duration` get gradients, and nothing else does.
@@ -67,7 +67,7 @@ def solve_adjoint(
         Kidger et al., "Hey, that's not an ODE", ICML 2021 (what steers the step size).
     """
     result: Tensor = _Adjoint.apply(  # type: ignore[no-untyped-call]
-        field, walk, weights, y, duration, *parameters
+        field, take_steps, weights, y, duration, *parameters
     )
     return result
 
@@ -79,16 +79,16 @@ class _Adjoint(torch.autograd.Function):
     def forward(
         ctx: Any,
         field: Field,
-        walk: Walk,
+        take_steps: TakeSteps,
         weights: tuple[float, ...],
         y: Tensor,
         duration: Tensor,
         *parameters: Tensor,
     ) -> Tensor:
         end = y.clone()  # a node can't return its own input, which a gap of 0 is left with
-        for state, _ in walk(field, end, duration):
+        for state, _ in take_steps(field, end, duration):
             end = state
-        ctx.field, ctx.walk, ctx.weights = field, walk, weights
+        ctx.field, ctx.take_steps, ctx.weights = field, take_steps, weights
         ctx.save_for_backward(end, duration, *parameters)
         return end
 
@@ -109,7 +109,7 @@ class _Adjoint(torch.autograd.Function):
         )
         state = torch.cat([end, gradient / scale], dim=1)
         try:
-            for after, taken in ctx.walk(augmented, state, duration, reuse=False):
+            for after, taken in ctx.take_steps(augmented, state, duration, reuse=False):
                 augmented.integrate(taken)
                 state = after
         except DivergenceError as error:

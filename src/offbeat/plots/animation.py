@@ -183,24 +183,24 @@ def _render_somehow(
     robot: str, truth: NDArray[np.float64], predicted: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     chosen = os.environ.get("MUJOCO_GL")
-    # Elsewhere than on Linux there is one backend, and MuJoCo takes it unasked.
+    # Elsewhere than on Linux there is one backend, and MuJoCo finds it by itself.
     backends = (chosen,) if chosen else ("egl", "osmesa") if sys.platform == "linux" else ("",)
-    faults = []
+    failures = []
     with tempfile.TemporaryDirectory(prefix="offbeat-") as folder:
         request, answer = Path(folder) / "request.npz", Path(folder) / "frames.npy"
         np.savez(request, robot=robot, truth=truth, predicted=predicted)
         for backend in backends:
-            fault = _render_with(backend, request, answer)
-            if fault is None:
+            failure = _render_with(backend, request, answer)
+            if failure is None:
                 frames: NDArray[np.uint8] = np.load(answer)
                 return frames
-            faults.append(f"{backend or 'the default'}: {fault}")
+            failures.append(f"{backend or 'the default'}: {failure}")
     fix = (
         "unset MUJOCO_GL, or set it to egl or osmesa"
         if chosen
         else "install a software renderer, on Debian: apt-get install libegl1 libosmesa6"
     )
-    raise MissingExtraError(f"MuJoCo cannot render here ({'; '.join(faults)}); {fix}")
+    raise MissingExtraError(f"MuJoCo cannot render here ({'; '.join(failures)}); {fix}")
 
 
 def _render_with(backend: str, request: Path, answer: Path) -> str | None:
@@ -264,7 +264,7 @@ def _timeline(page: Image, times: NDArray[np.float64], seen: NDArray[np.bool_], 
             draw.polygon([(x - 5, top + 28), (x + 6, top + 28), (x, top + 21)], fill=_INK)
     dot = (10, top + 5, 20, top + 15)
     draw.ellipse(dot, fill=_SEEN if seen[row] else _PAPER, outline=_SEEN if seen[row] else _PALE)
-    words = "row observed" if seen[row] else "row hidden"
+    words = "row observed" if seen[row] else "row masked"
     draw.text((28, top + 2), words, fill=_INK, font=ImageFont.load_default(13))
 
 

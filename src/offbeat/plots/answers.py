@@ -1,4 +1,4 @@
-"""A figure of fills and forecasts: what was observed, what was hidden, what was answered."""
+"""A figure of fills and forecasts: what was observed, what was masked, what was answered."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def answers(
     *,
     title: str = "",
 ) -> Figure:
-    """Draws channels over time: observed cells, hidden ones, and what predictors put there.
+    """Draws channels over time: observed values, masked values, and what predictors put there.
 
-    A predictor is drawn where its `observed` is False: what it says of cells that were measured is
-    no answer. Lines break where a cell was observed.
+    A predictor is drawn where its `observed` is False: what it says of values that were measured is
+    no answer. Lines break where a value was observed.
 
     Args:
-        truth: observed cells are black, cells that are known and hidden are hollow.
+        truth: observed values are black, values that are known and masked are hollow.
         answered: per predictor a trajectory on the same clock.
         channels: names of the channels to draw, one panel each.
         title: stands above the panels.
@@ -65,9 +65,9 @@ def answers(
 
 def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], name: str) -> None:
     channel = truth.names.index(name)
-    hidden = masked_values(truth)[:, channel]
+    masked = masked_values(truth)[:, channel]
     seen = truth.observed[:, channel]
-    drawn = [truth.values[seen | hidden, channel]]
+    drawn = [truth.values[seen | masked, channel]]
     black = STYLES["truth"].colour
     for model, trajectory in answered.items():
         at, style = trajectory.names.index(name), style_of(model)
@@ -83,17 +83,17 @@ def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], 
             label=style.label,
             zorder=3,
         )
-    if hidden.any():
+    if masked.any():
         axes.plot(
-            truth.times[hidden],
-            truth.values[hidden, channel],
+            truth.times[masked],
+            truth.values[masked, channel],
             linestyle="none",
             marker="o",
             markersize=3.4,
             markerfacecolor="white",
             markeredgecolor="#7F7F7F",
             markeredgewidth=0.8,
-            label="Hidden truth",
+            label="Masked truth",
             zorder=2,
         )
     axes.plot(
@@ -123,7 +123,7 @@ def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], 
 def _with_ends(
     trajectory: Trajectory, at: int, truth: Trajectory, channel: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The line of a predictor: its answers, tied to the observed cells beside them."""
+    """The line of a predictor: its answers, tied to the observed values beside them."""
     times, values = trajectory.times, trajectory.values[:, at].copy()
     filled = ~trajectory.observed[:, at]
     beside = np.zeros(len(filled), dtype=bool)

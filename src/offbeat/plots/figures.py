@@ -110,7 +110,7 @@ def predictions(
     what a model says before it has seen anything may leave the panel.
 
     Args:
-        truth: with the observed cells marked.
+        truth: with the observed values marked.
         predictions: per model a trajectory of the same channels, on the same clock.
         channels: names of the channels to draw, one panel each.
         title: stands above the panels.

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 _WIDTH = 7.0  # inches, two columns of a journal
 _BINS = 1400
 _MOST_LANES = 40
-_USUAL = 1.5  # a time between cells up to this many median ones is no gap
+_USUAL = 1.5  # a time between values up to this many median ones is no gap
 _MARKED, _MOST_MARKS = 3.0, 50  # the longest gaps of more than this many median ones have a mark
-_MEASURED, _HELD, _GAP = "#0072B2", "#E69F00", "#D55E00"
+_MEASURED, _REPEATED, _GAP = "#0072B2", "#E69F00", "#D55E00"
 
 
 @dataclass(frozen=True)
@@ -29,19 +29,19 @@ class _Lane:
     """Channels that were always measured together, drawn as one."""
 
     channels: tuple[int, ...]
-    held: bool
+    repeated: bool
 
 
 def log(dataset: Dataset, inspection: Inspection, *, title: str = "") -> Figure:
     """Draws when each channel was measured, and the time between rows.
 
     Above, a lane per channel, or per group of channels that were always measured together: full
-    colour where the channel's own rate is met, white where it is silent for longer than 1.5 times
-    its median step. Its 50 longest gaps of more than 3 median steps are marked, for they may be
-    narrower than a dot of the picture. Episodes stand where the recording's clock has them, with
-    their outages marked, or one after the other where they have no clock in common.
+    colour where the channel's own rate is met, white where nothing was measured for longer than
+    1.5 times its median step. Its 50 longest gaps of more than 3 median steps are marked, for they
+    may be narrower than a dot of the picture. Episodes stand where the recording's clock has them,
+    with their outages marked, or one after the other where they have no clock in common.
 
-    Below, the longest time between two rows in each of 1400 equal stretches of time.
+    Below, the longest time between two rows in each of 1400 equal intervals.
 
     Args:
         dataset: as it was inspected.
@@ -84,10 +84,10 @@ def log(dataset: Dataset, inspection: Inspection, *, title: str = "") -> Figure:
 
 def _lanes(dataset: Dataset, inspection: Inspection) -> list[_Lane]:
     together: dict[tuple[bytes, bool], list[int]] = {}
-    for c, facts in enumerate(inspection.channels):
+    for c, channel in enumerate(inspection.channels):
         mask = b"".join(np.packbits(t.known[:, c]).tobytes() for t in dataset)
-        together.setdefault((mask, bool(facts.rows_per_value)), []).append(c)
-    return [_Lane(tuple(channels), held) for (_, held), channels in together.items()]
+        together.setdefault((mask, bool(channel.rows_per_value)), []).append(c)
+    return [_Lane(tuple(channels), repeated) for (_, repeated), channels in together.items()]
 
 
 def _label(lane: _Lane, dataset: Dataset) -> str:
@@ -133,8 +133,8 @@ def _draw_lane(
     starts: NDArray[np.float64],
     edges: NDArray[np.float64],
 ) -> None:
-    facts = inspection.channels[lane.channels[0]]
-    if facts.rate_hz is None:
+    channel = inspection.channels[lane.channels[0]]
+    if channel.rate_hz is None:
         axes.text(
             0.5,
             row,
@@ -146,9 +146,9 @@ def _draw_lane(
             color=_GAP,
         )
     else:
-        fraction = _covered(dataset, lane.channels[0], 1 / facts.rate_hz, starts, edges)
+        fraction = _covered(dataset, lane.channels[0], 1 / channel.rate_hz, starts, edges)
         image = np.ones((1, _BINS, 4))
-        image[0, :, :3] = _rgb(_HELD if lane.held else _MEASURED)
+        image[0, :, :3] = _rgb(_REPEATED if lane.repeated else _MEASURED)
         image[0, :, 3] = fraction
         axes.imshow(
             image,
@@ -156,14 +156,14 @@ def _draw_lane(
             aspect="auto",
             interpolation="none",
         )
-        gaps = _marks(dataset, lane.channels[0], 1 / facts.rate_hz, starts)
+        gaps = _marks(dataset, lane.channels[0], 1 / channel.rate_hz, starts)
         axes.vlines(gaps, row - 0.46, row + 0.46, color=_GAP, linewidth=0.7)
-    rate = "" if facts.rate_hz is None else f"{facts.rate_hz:.3g} Hz, "
-    gap = "" if facts.longest_gap_s is None else f", gap {facts.longest_gap_s:.2g} s"
+    rate = "" if channel.rate_hz is None else f"{channel.rate_hz:.3g} Hz, "
+    gap = "" if channel.longest_gap_s is None else f", gap {channel.longest_gap_s:.2g} s"
     axes.text(
         1.01,
         row,
-        f"{rate}{100 * facts.missing:.0f} % missing{gap}",
+        f"{rate}{100 * channel.missing:.0f} % missing{gap}",
         fontsize=7,
         transform=axes.get_yaxis_transform(),
         va="center",
@@ -186,13 +186,13 @@ def _covered(
             continue
         at = at - trajectory.times[0] + start
         steps = np.diff(at)
-        # A cell stands for the time up to the next one; before a gap, for one step.
+        # A value stands for the time up to the next one; before a gap, for one step.
         lasts = np.append(np.where(steps <= _USUAL * step, steps, np.minimum(steps, step)), 0.0)
         ends = at + lasts
         points = np.column_stack([at, ends]).ravel()
         sums = np.column_stack([np.append(0.0, np.cumsum(lasts)[:-1]), np.cumsum(lasts)]).ravel()
         total += np.diff(np.interp(edges, points, sums))
-        # One that is alone in its stretch is seen all the same.
+        # One that is alone in its interval is seen all the same.
         place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(total) - 1)
         np.maximum.at(total, place, 0.25 * width)
     fraction: NDArray[np.float64] = np.clip(total / width, 0.0, 1.0)
@@ -266,11 +266,11 @@ def _legend(figure: Figure, lanes: list[_Lane], outages: bool) -> None:
     from matplotlib.patches import Patch
 
     shown: list[Any] = []
-    if any(not lane.held for lane in lanes):
+    if any(not lane.repeated for lane in lanes):
         shown.append(Patch(color=_MEASURED, label="measured"))
-    if any(lane.held for lane in lanes):
-        shown.append(Patch(color=_HELD, label="measured, values held"))
-    shown.append(Patch(facecolor="white", edgecolor="#999999", linewidth=0.6, label="silent"))
+    if any(lane.repeated for lane in lanes):
+        shown.append(Patch(color=_REPEATED, label="measured, values repeated"))
+    shown.append(Patch(facecolor="white", edgecolor="#999999", linewidth=0.6, label="not measured"))
     shown.append(Line2D([], [], color=_GAP, linewidth=0.9, label="a long gap begins"))
     if outages:
         shown.append(Patch(color=_GAP, alpha=0.18, label="outage, between episodes"))

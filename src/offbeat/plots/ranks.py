@@ -23,8 +23,8 @@ _INK, _GREY = "#1A1A1A", "#7F7F7F"
 def ranks_figure(results: FriedmanResult | Mapping[str, FriedmanResult]) -> Figure:
     """Draws average ranks on a line, the best at the left, one panel per result.
 
-    Demsar (2006), figure 1. A grey bar joins models that Nemenyi's test does not tell apart; the
-    bar at the top shows how far apart two average ranks must be.
+    Demsar (2006), figure 1. A grey bar joins models that do not differ significantly by Nemenyi's
+    test; the bar at the top shows how far apart two average ranks must be.
 
     Args:
         results: of `friedman`, one or several by title.

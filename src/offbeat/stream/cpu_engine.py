@@ -86,7 +86,7 @@ class CpuEngine(Engine):
         self._kept = [None] * slots
 
     def reset(self) -> None:
-        """Begins anew, with the first random number."""
+        """Starts again, with the first random number."""
         self._live.reset()
         self._generator = torch.Generator().manual_seed(self._seed) if self._fraction else None
 

@@ -34,7 +34,7 @@ class Engine(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Begins anew: nothing observed yet."""
+        """Starts again: nothing observed yet."""
 
     @abstractmethod
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:

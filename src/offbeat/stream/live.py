@@ -188,7 +188,7 @@ class LiveStream:
         return predicted if several else predicted[0]
 
     def reset(self) -> None:
-        """Begins anew: nothing observed yet. The counters go on."""
+        """Starts again: nothing observed yet. The counters go on."""
         self._placing.begin_anew()
 
     def state(self) -> dict[str, Any]:

@@ -37,7 +37,7 @@ class StreamOptions:
         reorder_rows: rows that are kept for `reorder`; what is older than these is dropped.
         stale_after_s: s; what is older than this on arrival is dropped, whatever `late` says:
             behind the `now` that `observe` is given, or else behind the newest row. None: never.
-        jump: when the clock has jumped, `reset`, begin anew at the new time; `continue`, keep the
+        jump: when the clock has jumped, `reset`, start again at the new time; `continue`, keep the
             state and take the jump for one median gap; `drop`, only the old clock counts, and what
             is far behind it is late; or `error`.
         jump_back_s: s; a message older than the newest row by more than this may mean a clock that
@@ -48,7 +48,7 @@ class StreamOptions:
             pending, and one message on the old clock makes them late ones. Nothing pending is
             lost: after the jump they are consumed.
         long_gap: after more than `long_gap_s` without a value, `saturate`, let the model's own
-            limit act, or `reset`, begin anew.
+            limit act, or `reset`, start again.
         long_gap_s: s; None is the model's own limit, where time saturates.
         window_rows: newest rows that a model without a recurrent state is run on; None: as many as
             the longest trajectory that it was trained on.
@@ -123,7 +123,7 @@ class StreamCounters:
         jumps_ahead: times the clock was set ahead.
         long_gaps: gaps longer than the limit.
         longest_gap_s: s, the longest time without a value.
-        resets: times the state began anew, for whatever reason.
+        resets: times the state started again, for whatever reason.
         predictions: times predicted at.
     """
 

@@ -50,7 +50,7 @@ class TorchEngine(Engine):
         self._slots = [None] * slots
 
     def reset(self) -> None:
-        """Begins anew, with the first random number."""
+        """Starts again, with the first random number."""
         feeding = bool(self._model.config.self_feeding)
         generator = torch.Generator().manual_seed(self._seed) if feeding else None
         with torch.inference_mode():

@@ -165,7 +165,7 @@ class TransformedEngine(Engine):
         self._slots = [self._state] * slots
 
     def reset(self) -> None:
-        """Begins anew: no turns, no signs."""
+        """Starts again: no turns, no signs."""
         self._engine.reset()
         self._state = self._live.start()
 

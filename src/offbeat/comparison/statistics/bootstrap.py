@@ -78,8 +78,8 @@ def bca(
         return nothing
     bias, lean = ndtri(below), _acceleration(statistic, samples, paired)
     tail = ndtri((1 - confidence) / 2)
-    shares = [ndtr(bias + (bias + z) / (1 - lean * (bias + z))) for z in (tail, -tail)]
-    low, high = np.quantile(spread, shares)
+    fractions = [ndtr(bias + (bias + z) / (1 - lean * (bias + z))) for z in (tail, -tail)]
+    low, high = np.quantile(spread, fractions)
     return Estimate(value, float(low), float(high), confidence, "bca_bootstrap")
 
 

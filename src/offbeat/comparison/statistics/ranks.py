@@ -30,8 +30,8 @@ class FriedmanResult:
             significantly.
         alpha: level of significance of the critical difference.
         nemenyi_p: (models, models) p-values of Nemenyi's test, 1 on the diagonal.
-        groups: maximal runs of models, best first, that the critical difference does not tell
-            apart; those of one model are left out.
+        groups: maximal runs of models, best first, that differ by less than the critical
+            difference; those of one model are left out.
     """
 
     names: tuple[str, ...]
@@ -84,7 +84,7 @@ def critical_difference(models: int, blocks: int, *, alpha: float = 0.05) -> flo
 
 
 def friedman(scores: Mapping[str, ArrayLike], *, alpha: float = 0.05) -> FriedmanResult:
-    """Tests whether models rank alike over blocks, and which ones Nemenyi's test tells apart.
+    """Tests whether models rank alike over blocks, and which differ by Nemenyi's test.
 
     Friedman, J. Am. Stat. Assoc. 32 (1937) 675. The blocks must be independent of each other;
     within a block nothing is assumed but that scores can be ranked.

@@ -151,7 +151,7 @@ class ThesisTest:
 
     @property
     def equal_variances(self) -> bool:
-        """Bartlett's test does not tell the variances apart."""
+        """The variances do not differ significantly by Bartlett's test."""
         return self.bartlett.p > self.alpha
 
     @property
