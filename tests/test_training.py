@@ -391,7 +391,7 @@ def test_what_is_asked_for_replaces_the_recipe():
     asked = ob.TrainConfig(epochs=1, optimizer="sgd", clip_norm=math.inf, keep="last")
     model = ob.make_model("anchored_ode_gru_d", TRAIN, **SMALL)
     recipe = ob.fit(model, TRAIN, VALIDATION, asked, progress=False).recipe
-    assert (recipe.optimizer, recipe.clip_norm, recipe.keep) == ("sgd", math.inf, "last")
+    assert (recipe.optimizer, recipe.clip_norm, recipe.keep) == ("sgd", None, "last")
     assert recipe.learning_rate == 2e-3
 
 
@@ -405,6 +405,11 @@ def test_a_validation_set_of_which_nothing_counts_is_refused():
             ob.make_model("gru", TRAIN, **SMALL), TRAIN, once,
             ob.TrainConfig(epochs=1, keep="best"), progress=False,
         )  # fmt: skip
+    result = ob.fit(
+        ob.make_model("gru", TRAIN, **SMALL), TRAIN, once, ob.TrainConfig(epochs=1), progress=False
+    )
+    assert math.isnan(result.history[-1].validation_mse)
+    assert result.recipe.keep == "last"
 
 
 def test_a_callback_sees_every_epoch_and_can_stop():

@@ -5,6 +5,7 @@ Table 2.1 of the thesis, as code. Models of one's own are registered beside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
@@ -233,6 +234,8 @@ def recipe_of(name: str, config: TrainConfig | None = None, *, validated: bool) 
     """
     own = MODELS[name].recipe if name in MODELS else _FOREIGN_RECIPE
     asked = {} if config is None else {k: v for k, v in asdict(config).items() if v is not None}
+    if asked.get("clip_norm") == math.inf:
+        asked["clip_norm"] = None
     return Recipe(**{"keep": "best" if validated else "last", **own, **asked})
 
 
