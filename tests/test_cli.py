@@ -393,6 +393,15 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(run, data, tmp_path, capsys
         assert f"--split.observed_fraction must be above 0 and at most 1, got {fraction}" in error
     error = one_line_error(capsys, "train", data, out, "--model.name=ode_rn")
     assert "did you mean 'ode_rnn'" in error
+    config = tmp_path / "of_0_1_0.yaml"
+    config.write_text("model: {age_input: gap}")
+    for old, new in (
+        ("--parts.window=20", "--split.window"),
+        ("--parts.hide=rows", "--split.mask"),
+        ("--model.age_unit=gap", "--model.time_input_unit"),
+        (f"--config={config}", "--model.time_input"),
+    ):
+        assert f"did you mean {new!r}" in one_line_error(capsys, "train", data, out, old)
     error = one_line_error(capsys, "train", data, out, "--training.epochs=none")
     assert "epochs" in error
     for option in ("--split.seed=-1", "--training.seed=-1", "--seed=-1"):

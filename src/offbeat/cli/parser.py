@@ -36,6 +36,17 @@ set_parsing_settings(
 )
 
 
+_RENAMED = {
+    "hide": "mask",
+    "model.age_input": "model.time_input",
+    "model.age_unit": "model.time_input_unit",
+    "parts.hide": "split.mask",
+    "parts.split": "split.by",
+    "reader.held": "reader.repeated",
+}
+"""Options of 0.1.0, and what replaces them."""
+
+
 class Option(NamedTuple):
     """An option without a default: only where it is given, it is in the mapping of its group."""
 
@@ -167,8 +178,14 @@ class CommandParser(ArgumentParser):
         unknown = re.search(r"unrecognized arguments: --([\w.]+)", message, re.IGNORECASE)
         unknown = unknown or re.search(r"does not accept option '([\w.]+)'", message)
         if unknown and "did you mean" not in message:
-            known = [name for name in self._option_string_actions if "=" not in name]
-            near = difflib.get_close_matches(f"--{unknown[1]}", known, n=1, cutoff=0.7)
+            within = re.search(r"Subcommand '(\w+)'", message)
+            parser: Any = self
+            if within and self._subcommands_action:
+                parser = self._subcommands_action._name_parser_map[within[1]]
+            known = [name for name in parser._option_string_actions if "=" not in name]
+            new = _RENAMED.get(unknown[1], unknown[1])
+            new = re.sub("^parts[.]", "split.", re.sub("^policies[.]", "options.", new))
+            near = difflib.get_close_matches(f"--{new}", known, n=1, cutoff=0.7)
             message += f"; did you mean {near[0]!r}?" if near else ""
         elif re.search("unrecognized arguments: [^-]", message, re.IGNORECASE):
             message += "; all paths stand together" if "together" not in message else ""
