@@ -412,6 +412,16 @@ def test_a_validation_set_of_which_nothing_counts_is_refused():
     assert result.recipe.keep == "last"
 
 
+def test_where_nothing_of_the_validation_set_counts_the_recipe_says_that_the_last_is_kept():
+    once = ob.Dataset(
+        tuple(replace(t, observed=np.zeros_like(t.observed)) for t in swinging(3)), {}
+    )
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    config = ob.TrainConfig(epochs=1)
+    assert ob.fit(model, TRAIN, once, config, progress=False).recipe.keep == "last"
+    assert ob.fit(model, TRAIN, VALIDATION, config, progress=False).recipe.keep == "best"
+
+
 def test_a_callback_sees_every_epoch_and_can_stop():
     seen = []
 
