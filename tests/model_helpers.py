@@ -79,7 +79,7 @@ def small_model(
 
 
 def with_growing_decays(model: Model) -> Model:
-    """Decays that grow with age, as at the start of training: below 0 they get no gradient."""
+    """Decays that grow with time, as at the start of training: below 0 they get no gradient."""
     with torch.no_grad():
         for part in (model.decay, model.input_decay):
             for parameter in part.parameters() if part is not None else ():

@@ -1,4 +1,4 @@
-"""Random scans, small and large, for tests that compare bodies."""
+"""Random scans, small and large, for tests that compare backends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Padding, taking parts, and the ages that follow from times and masks."""
+"""Padding, taking parts, and the times since observation that follow from times and masks."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ def test_a_shift_of_the_clock_changes_nothing(variant: str) -> None:
         assert torch.equal(predictions(model, raw), expected)
 
 
-# --- causality, hidden values ---------------------------------------------------------------------
+# --- causality, masked values ---------------------------------------------------------------------
 
 
 @variants
@@ -237,7 +237,7 @@ def test_a_value_moves_only_the_predictions_after_it(variant: str) -> None:
 
 
 @variants
-def test_hidden_values_never_leak(variant: str) -> None:
+def test_masked_values_never_leak(variant: str) -> None:
     model = build(variant)
     batch = model.batch(dataset(4))
     expected = predictions(model, batch)
@@ -249,7 +249,7 @@ def test_hidden_values_never_leak(variant: str) -> None:
 
 
 @variants
-def test_hidden_values_leave_no_trace_in_gradients(variant: str) -> None:
+def test_masked_values_leave_no_trace_in_gradients(variant: str) -> None:
     model = build(variant)
     batch = model.batch(dataset(3))
     hidden = replace(batch, values=torch.where(batch.mask, batch.values, float("nan")))
@@ -267,12 +267,12 @@ def test_hidden_values_leave_no_trace_in_gradients(variant: str) -> None:
 
 
 def in_parts(model: Model, batch: Batch, edges: list[int]) -> Tensor:
-    carry = model.empty_state(len(batch))
+    past = model.empty_state(len(batch))
     parts = []
     with torch.no_grad():
         for start, stop in pairwise(edges):
-            output = model(rows_of(batch, start, stop), past=carry)
-            carry = output.past
+            output = model(rows_of(batch, start, stop), past=past)
+            past = output.past
             parts.append(output.mean)
     return torch.cat(parts, dim=1) * batch.valid[..., None]
 

@@ -22,7 +22,7 @@ MEAN = torch.tensor([50.0, 60.0, 70.0], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class Case:
-    """Trajectories of different lengths, hardly to fully observed, and limits for the ages."""
+    """Trajectories of different lengths, hardly to fully observed, and limits for the times."""
 
     trajectories: list[Trajectory]
     limit: float
@@ -55,10 +55,10 @@ def empty(batch: Batch) -> RecurrentState:
 
 
 def measured(
-    case: Case, batch: Batch, carry: RecurrentState | None = None
+    case: Case, batch: Batch, past: RecurrentState | None = None
 ) -> tuple[ElapsedTimes, RecurrentState]:
-    carry = carry or empty(batch)
-    return elapsed_times(batch, carry, elapsed_limit=case.limit, from_first_row=case.from_first_row)
+    past = past or empty(batch)
+    return elapsed_times(batch, past, elapsed_limit=case.limit, from_first_row=case.from_first_row)
 
 
 def by_hand(
@@ -115,16 +115,16 @@ def test_a_carry_over_any_split_of_the_rows_gives_the_same(case: Case, cuts: lis
     batch = case.batch
     whole, end = measured(case, batch)
     edges = sorted({0, batch.rows, *(c for c in cuts if c < batch.rows)})
-    carry, parts = empty(batch), []
+    past, parts = empty(batch), []
     for start, stop in pairwise(edges):
-        part, carry = measured(case, rows_of(batch, start, stop), carry)
+        part, past = measured(case, rows_of(batch, start, stop), past)
         parts.append(part)
     for name in NAMES:
         joined = torch.cat([getattr(part, name) for part in parts], dim=1)
         assert torch.equal(joined, getattr(whole, name)), name
     for name in ("time", "start", "observed_at", "channel_at", "last"):
-        assert torch.equal(getattr(carry, name), getattr(end, name)), name
-    assert carry.rows == end.rows == batch.rows
+        assert torch.equal(getattr(past, name), getattr(end, name)), name
+    assert past.rows == end.rows == batch.rows
 
 
 @given(cases())
@@ -194,7 +194,7 @@ def test_limited_ages_never_exceed_the_limit_nor_shrink_between_observations(cas
     for name in ("elapsed", "elapsed_before", "gap"):
         value = getattr(got, name)
         assert ((value >= 0) & (value <= limit)).all(), name
-    # All ages stop together: what an age has grown by over a gap is the gap.
+    # All times stop together: what a time has grown by over a gap is the gap.
     grown = got.delta - got.delta_before
     assert torch.allclose(grown, got.gap[..., None].expand_as(grown), rtol=0, atol=1e-12)
     assert (got.delta >= got.delta_before).all()
@@ -204,9 +204,9 @@ def test_limited_ages_never_exceed_the_limit_nor_shrink_between_observations(cas
 def test_nothing_observed_means_that_no_time_passes() -> None:
     one = Trajectory([0.0, 5.0, 1e4], np.zeros((3, 3)), observed=np.zeros((3, 3), dtype=bool))
     batch = Batch.of([one], dtype=torch.float64)
-    got, carry = elapsed_times(batch, empty(batch), elapsed_limit=FAR)
+    got, past = elapsed_times(batch, empty(batch), elapsed_limit=FAR)
     for name in ("gap", "elapsed", "elapsed_before", "delta", "delta_before"):
         assert (getattr(got, name) == 0).all(), name
     assert (got.last == MEAN).all()
     assert not got.observed.any()
-    assert carry.start.tolist() == [float("inf")]
+    assert past.start.tolist() == [float("inf")]

@@ -42,7 +42,7 @@ FIRST_ROW = [True, False, True]
 
 
 def sample(*, whole_rows: bool = False, seed: int = 5) -> Dataset:
-    """One trajectory with hidden rows, masks per channel, and something observed in row 0."""
+    """One trajectory with masked rows, masks per channel, and something observed in row 0."""
     one = trajectory(seed, ROWS, whole_rows=whole_rows)
     observed = one.observed.copy()
     observed[0] = True if whole_rows else FIRST_ROW
@@ -61,7 +61,7 @@ def late_sample(*, whole_rows: bool = False) -> Dataset:
 
 
 def rows_of(model: Model, data: Dataset) -> list[tuple[float, Tensor, Tensor]]:
-    """Of the first trajectory: model time, scaled values with 0 where hidden, and mask."""
+    """Of the first trajectory: model time, scaled values with 0 where masked, and mask."""
     one = data[0]
     values = torch.from_numpy(model.scaler.scaled(one.values))
     mask = torch.tensor(one.observed)

@@ -15,11 +15,12 @@ import pytest
 import torch
 
 import offbeat as ob
+from offbeat.models.checkpoint import load_training_state, save_training_state
 from offbeat.models.zoo import ZOO, train_config
 
 
 def swinging(n: int = 12, rows: int = 20, seed: int = 0) -> ob.Dataset:
-    """Pendulums of random phase, half of the cells hidden, each on its own times."""
+    """Pendulums of random phase, half of the values masked, each on its own times."""
     random = np.random.default_rng(seed)
     trajectories = []
     for _ in range(n):
@@ -363,6 +364,19 @@ def test_a_run_does_not_go_on_with_another_validation_set(tmp_path):
             ob.make_model("gru", TRAIN, **SMALL), TRAIN, other,
             ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path, progress=False,
         )  # fmt: skip
+
+
+def test_a_run_whose_checkpoint_does_not_say_on_which_data_is_not_resumed(tmp_path):
+    """Those of 0.1.0 have counts and sums alone."""
+    config = ob.TrainConfig(epochs=1)
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    ob.fit(model, TRAIN, config=config, out=tmp_path, progress=False)
+    (checkpoint,) = (tmp_path / "checkpoints").iterdir()
+    _, tensors, record = load_training_state(checkpoint)
+    del record["identity"]["train"]["fingerprint"]
+    save_training_state(model, tensors, record, checkpoint)
+    with pytest.raises(ob.InputError, match=r"a run of Offbeat 0\.1.* give another folder"):
+        ob.fit(ob.make_model("gru", TRAIN, **SMALL), TRAIN, out=tmp_path, progress=False)
 
 
 # --- recipes, devices, callbacks ------------------------------------------------------------------
