@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -12,6 +13,8 @@ from typing import Any
 from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 from thesis.protocol import Protocol
 from thesis.record import Record
+
+ROOT = Path(__file__).parents[2]
 
 SMALL = replace(
     Protocol(),
@@ -94,5 +97,7 @@ def wait_until(true: Any, *, seconds: float = 240.0, process: Any = None) -> Non
 
 
 def start(command: list[str]) -> Any:
-    """A process whose standard error can be read."""
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    """A process whose standard error can be read, and which finds `thesis` as from the project."""
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
