@@ -263,7 +263,13 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
             )
     model.load_state_dict(weights)
     prefix = "optimizer."
-    moments = {k[len(prefix) :]: v for k, v in tensors.items() if k.startswith(prefix)}
+    device = state.parameters.flat.device
+    moments = {
+        # A count of steps, which has no axes, stays with the optimizer's numbers.
+        k[len(prefix) :]: v.to(device) if v.ndim else v
+        for k, v in tensors.items()
+        if k.startswith(prefix)
+    }
     if moments:
         state.optimizer.state[state.parameters.flat] = moments
     state.best = {k[len("best.") :]: v for k, v in tensors.items() if k.startswith("best.")}

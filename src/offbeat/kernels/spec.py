@@ -288,8 +288,9 @@ class StepTable:
         """Some trajectories, trimmed to the longest of them.
 
         Args:
-            index: (batch,) positions, int64.
+            index: (batch,) positions, int64, on any device.
         """
+        index = index.to(self.table.device)
         length = None if self.length is None else self.length.index_select(0, index)
         rows = self.table.shape[1] if length is None else int(length.max())
         return TableSteps(self, index, rows, length)
