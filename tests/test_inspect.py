@@ -96,7 +96,7 @@ def test_the_command_of_the_advice_trains(damaged, tmp_path, capsys):
     small = ["--model.name=gru", "--model.hidden_size=4", "--training.epochs=1"]
     assert main([*told["advice"]["command"][1:], *small]) == 0
     kept = json.loads((tmp_path / "run" / "reader.json").read_text())
-    assert kept == {"without": ["broken"], "repeated": "mask"}
+    assert kept == {"without": ["broken"], "repeated": "mask", "angles": ["yaw"]}
     predictions = tmp_path / "predictions.csv"
     assert main(["predict", str(tmp_path / "run"), str(damaged), str(predictions)]) == 0
     assert "broken" not in predictions.read_text().splitlines()[0]
@@ -124,3 +124,15 @@ def test_a_real_flight_log_shows_its_streams_gaps_and_dropouts():
     assert rates["vehicle_attitude.q[0]"] == pytest.approx(83, rel=0.02)
     assert rates["vehicle_local_position.z"] == pytest.approx(10, rel=0.01)
     assert any("4 dropouts" in said for said in found.found)
+
+
+def test_an_angle_that_wraps_is_named_in_the_advice():
+    times = np.arange(0, 60, 0.01)
+    wrapped = (0.8 * times + np.pi) % (2 * np.pi) - np.pi
+    degrees = np.degrees((1.1 * times) % (2 * np.pi))
+    noise = np.random.default_rng(0).uniform(-np.pi, np.pi, len(times))
+    values = np.column_stack([wrapped, degrees, np.sin(times), noise, wrapped])
+    names = ("heading", "bearing", "joint", "noise", "position")
+    units = ("rad", "deg", "rad", "rad", "m")
+    data = ob.Dataset((ob.Trajectory(times, values, names=names, units=units),))
+    assert "--reader.angles=[heading, bearing]" in advise(data, "log.csv").command

@@ -8,9 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from offbeat.data.cleaning.log import listed
 from offbeat.data.inspection import ChannelInspection, Inspection, inspect, without_repeats
 from offbeat.data.trajectory import Dataset
+from offbeat.data.transforms import full_turn, is_angle_unit, lowest_of
 
 _ROWS = 100  # of a window, unless a slow sensor needs more
 _MOST_ROWS = 1000
@@ -45,7 +48,7 @@ def advise(
     out: str = "runs/log",
     *,
     reader: Mapping[str, Any] | None = None,
-    known: Sequence[str] = ("without", "repeated"),
+    known: Sequence[str] = ("without", "repeated", "angles"),
 ) -> Advice:
     """Chooses options of `train` for a data set.
 
@@ -79,10 +82,35 @@ def advise(
         )
         # What follows must hold for the data as they will be read.
         inspection = inspect(without_repeats(dataset))
+    wrapping = _wrapping(dataset)
+    if wrapping and "angles" in known:
+        options["angles"] = [*options.get("angles", ()), *wrapping]
+        reasons.append(
+            f"angles: there are jumps by a full turn in {listed(wrapping)}; an unwrapped angle has "
+            "no jumps to predict, and a stream gives it back wrapped"
+        )
     words = [f"--reader.{name}={_text(value)}" for name, value in options.items()]
     split, for_split = _split(inspection)
     words += [f"--split.{name}={chosen}" for name, chosen in split.items()]
     return Advice(("offbeat", "train", data, out, *words), (*reasons, *for_split))
+
+
+def _wrapping(dataset: Dataset) -> list[str]:
+    """Channels in units of angle that jump by a full turn, and otherwise move by far less."""
+    found = []
+    for c, (name, unit) in enumerate(zip(dataset.names, dataset.units, strict=True)):
+        if not is_angle_unit(unit):
+            continue
+        turn = full_turn(unit)
+        columns = [t.values[t.known[:, c], c] for t in dataset]
+        values = np.concatenate(columns)
+        steps = np.concatenate([np.abs(np.diff(column)) for column in columns])
+        if not len(steps) or lowest_of(values.min(), values.max(), turn) is None:
+            continue
+        jumps = steps > 0.75 * turn
+        if jumps.any() and jumps.mean() < 0.1 and (steps[~jumps] < 0.25 * turn).all():
+            found.append(name)
+    return found
 
 
 def _useful(inspection: Inspection) -> list[ChannelInspection]:

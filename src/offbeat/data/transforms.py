@@ -30,6 +30,11 @@ NO_LENGTH = 1e-6
 """A quaternion that is shorter than this has no direction."""
 
 
+def is_angle_unit(unit: str) -> bool:
+    """Whether a unit is one of radians or degrees."""
+    return unit.casefold() in (*_DEGREES, "rad", "radian", "radians")
+
+
 def full_turn(unit: str) -> float:
     """A full turn in the unit of an angle channel: 360 for degrees, else 2 pi."""
     return 360.0 if unit.casefold() in _DEGREES else 2 * math.pi
