@@ -293,6 +293,13 @@ def test_an_unknown_part_lists_the_choices(options, message):
         ob.make_model("ode_rnn", dataset(4), **options)
 
 
+def test_what_is_neither_a_model_nor_a_part_is_refused_when_it_is_registered():
+    with pytest.raises(ob.InputError, match="a model must be a class.*got 3"):
+        ob.register_model("three", 3)
+    with pytest.raises(ob.InputError, match="a part must be a class, got 3"):
+        ob.register_part("head", "three", 3)
+
+
 def test_an_unknown_kind_of_part_lists_the_kinds():
     with pytest.raises(ob.InputError, match=r"unknown kind of part 'sell'.*cell"):
         ob.register_part("sell", "x", Cell)

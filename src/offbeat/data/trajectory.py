@@ -222,8 +222,8 @@ def _check_times(times: NDArray[np.float64], where: str) -> None:
     if late.any():
         row = int(late.argmax()) + 1
         raise InputError(
-            f"times{where} must increase strictly, got {times[row - 1]!r} at row {row - 1} and "
-            f"{times[row]!r} at row {row}; sort the rows and drop repeated times"
+            f"times{where} must increase strictly, got {float(times[row - 1])} at row "
+            f"{row - 1} and {float(times[row])} at row {row}; sort the rows and drop repeated times"
         )
 
 

@@ -156,7 +156,7 @@ def register_model(
         replace: allow a name that is taken.
 
     Raises:
-        InputError: the name is taken, or a field is unknown.
+        InputError: the name is taken, a field is unknown, or the model is nothing of these.
     """
     composed = isinstance(model, Mapping)
     common = _THESIS_RECIPE if composed else _FOREIGN_RECIPE
@@ -166,6 +166,10 @@ def register_model(
         for key in model:
             one_of("model option", key, [f.name for f in fields(ModelConfig)])
         entry = ModelEntry(dict(model), chosen)
+    elif not callable(model):
+        raise InputError(
+            f"a model must be a class, a function that makes a module, or a mapping, got {model!r}"
+        )
     else:
         entry = ModelEntry({}, chosen, model)
     MODELS.register(name, entry, replace=replace)

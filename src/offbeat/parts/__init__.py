@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from offbeat.errors import one_of
+from offbeat.errors import InputError, one_of
 from offbeat.parts.cells import CELLS, Cell
 from offbeat.parts.fields import FIELDS, Perceptron
 from offbeat.parts.heads import HEADS, Gaussian, Head, HeadShape, Point, Prediction
@@ -45,8 +45,10 @@ def register_part(kind: str, name: str, part: Part, *, replace: bool = False) ->
         The part.
 
     Raises:
-        InputError: unknown kind, or a name that is taken.
+        InputError: unknown kind, a name that is taken, or a part that is no class.
     """
     one_of("kind of part", kind, _KINDS)
+    if not callable(part):
+        raise InputError(f"a part must be a class, got {part!r}")
     _KINDS[kind].register(name, part, replace=replace)  # type: ignore[arg-type]
     return part

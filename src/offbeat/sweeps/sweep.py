@@ -214,6 +214,8 @@ def _choices(
     training: TrainConfig | Mapping[str, TrainConfig] | None,
     epochs: int | None,
 ) -> tuple[tuple[str, ModelConfig, TrainConfig], ...]:
+    if isinstance(models, str):
+        models = [models]
     configs = [ModelConfig(m) if isinstance(m, str) else m for m in _values(models)]
     labels = list(models) if isinstance(models, Mapping) else [c.name for c in configs]
     if not labels or len(set(labels)) < len(labels):
