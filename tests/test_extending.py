@@ -294,7 +294,7 @@ def test_an_unknown_part_lists_the_choices(options, message):
 
 
 def test_what_is_neither_a_model_nor_a_part_is_refused_when_it_is_registered():
-    with pytest.raises(ob.InputError, match="a model must be a class.*got 3"):
+    with pytest.raises(ob.InputError, match=r"a model must be a class.*got 3"):
         ob.register_model("three", 3)
     with pytest.raises(ob.InputError, match="a part must be a class, got 3"):
         ob.register_part("head", "three", 3)

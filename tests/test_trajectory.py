@@ -35,7 +35,7 @@ def test_a_trajectory_cannot_be_changed():
     [
         ({"times": [0.0, np.nan, 0.2]}, "finite seconds, got nan at row 1"),
         ({"times": [0.0, np.inf, 0.2]}, "finite seconds, got inf at row 1"),
-        ({"times": [0.0, 0.2, 0.1]}, r"got np.float64\(0.2\) at row 1 and .*0.1.* at row 2"),
+        ({"times": [0.0, 0.2, 0.1]}, r"got 0.2 at row 1 and .*0.1.* at row 2"),
         ({"times": [0.0, 0.0, 0.1]}, "must increase strictly"),
         ({"times": [0.0, 0.1]}, r"values .*2 rows, as times has, got shape \(3, 2\)"),
         ({"times": [[0.0], [0.1], [0.2]]}, r"shape \(rows,\)"),
