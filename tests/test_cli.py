@@ -185,7 +185,7 @@ def test_a_flag_takes_true_or_false_alone(capsys):
 
 def test_paths_stand_together(capsys):
     error = one_line_error(capsys, "compare", "a", "--json", "b")
-    assert error.endswith("unrecognized arguments: b; all paths stand together")
+    assert error.endswith("unrecognized arguments: b; give all paths together")
 
 
 def test_a_config_counts_where_nothing_is_typed_before_or_after_it(tmp_path):

@@ -119,7 +119,7 @@ def test_a_difference_that_is_not_there_is_not_found(tmp_path):
     table = rows({"gru": 0.03, "lstm": 0.03, "rnn": 0.03}, repeats=10)
     found = compare(write(tmp_path / "a.csv", table), resamples=200)
     assert [p.better for p in found.conditions[0].pairs] == [None, None, None]
-    assert "no difference shown" in found.text()
+    assert "no significant difference" in found.text()
 
 
 def test_the_summary_holds_the_last_value_and_names_the_best_first(record):
@@ -256,8 +256,8 @@ def test_models_whose_scores_are_equal_are_refused_under_their_condition(tmp_pat
         ({"baseline": "ode_rn"}, "unknown model 'ode_rn'.*did you mean 'ode_rnn'"),
         ({"models": ["gru"]}, "at least two different models, got: gru"),
         ({"models": ["gru", "gru"]}, "at least two different models"),
-        ({"alpha": 5}, "alpha must lie between 0 and 1"),
-        ({"confidence": 95}, "confidence must lie between 0 and 1"),
+        ({"alpha": 5}, "alpha must be between 0 and 1"),
+        ({"confidence": 95}, "confidence must be between 0 and 1"),
         ({"metric": "after_first_row"}, "has no after_first_row score"),
     ],
 )
@@ -290,7 +290,7 @@ def test_the_same_run_twice_is_refused(tmp_path, record):
         ("model,repeat,after_first_observation_mse\n", "has no rows"),
         (
             "model,repeat,after_first_observation_mse\ngru,1,many\n",
-            "row 1 of .*'many' is no number",
+            "row 1 of .*'many' is not a number",
         ),
         ("model,repeat,after_first_observation_mse\ngru,1\n", "cannot be read as a table of runs"),
     ],
@@ -305,7 +305,7 @@ def test_a_table_that_is_none_of_runs_is_refused_in_one_line(tmp_path, text, sai
 
 def test_what_is_no_run_is_refused(tmp_path):
     for path, said in (
-        (tmp_path / "nothing", "is not there"),
+        (tmp_path / "nothing", "does not exist"),
         (tmp_path, "neither results.json nor a record"),
     ):
         with pytest.raises(FileFormatError, match=said):
@@ -316,7 +316,7 @@ def test_what_is_no_run_is_refused(tmp_path):
     (tmp_path / "a.txt").write_text("x")
     with pytest.raises(InputError, match=r"unknown suffix of a\.txt '\.txt'"):
         read_runs(tmp_path / "a.txt")
-    with pytest.raises(InputError, match="got no runs"):
+    with pytest.raises(InputError, match="no runs; give folders"):
         read_runs([])
 
 
@@ -335,7 +335,7 @@ def test_runs_are_chosen_by_the_values_of_columns(record):
 def test_the_choice_on_the_command_line_is_read():
     assert parse_only("experiment=2, model=gru") == {"experiment": "2", "model": "gru"}
     assert parse_only(None) == {}
-    with pytest.raises(InputError, match="got 'gru' to choose runs by, expected name=value"):
+    with pytest.raises(InputError, match="got 'gru' to select runs by, expected name=value"):
         parse_only("experiment=2,gru")
 
 
@@ -542,7 +542,7 @@ def test_a_damaged_run_is_refused_in_one_line(runs, tmp_path):
     with pytest.raises(FileFormatError, match=r"config\.yaml is damaged"):
         read_runs(folder)
     (folder / "config.yaml").write_text("model: {}")
-    with pytest.raises(FileFormatError, match="is no run of 'offbeat train'"):
+    with pytest.raises(FileFormatError, match="is not a run of 'offbeat train'"):
         read_runs(folder)
 
 
@@ -587,7 +587,7 @@ def test_the_command_draws_the_diagram(record, tmp_path, capsys):
             ["--models", "[gru, ode_rnn]", "--figure", "a.png"],
             "three or more models; leave out --figure",
         ),
-        (["nowhere"], "nowhere is not there"),
+        (["nowhere"], "nowhere does not exist"),
     ],
 )
 def test_the_command_says_what_is_wrong_in_one_line(record, options, said, capsys):

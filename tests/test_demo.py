@@ -168,7 +168,7 @@ def test_an_error_in_a_process_that_trains_is_raised_here(copy):
 
 def test_a_process_that_was_killed_is_reported_with_what_to_do():
     lost = Ending(SimpleNamespace(name="gru"), lost=True)
-    with pytest.raises(OffbeatError, match="trained 'gru' was ended; run the same again"):
+    with pytest.raises(OffbeatError, match="trained 'gru' was killed; run the same again"):
         side_by_side.raise_failure(lost)
 
 

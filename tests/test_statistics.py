@@ -503,7 +503,7 @@ UNPAIRED = [thesis_test, two_sample_t, welch_t, bartlett, levene]
         ([1.0, 2.0, 4.0], [3.0, math.inf, 6.0], "holds inf at place 1"),
         ([[1.0, 2.0, 4.0]], [3.0, 4.0, 6.0], r"shape \(runs,\), got shape \(1, 3\)"),
         (["x", "y", "z"], [3.0, 4.0, 6.0], "must be a list of numbers"),
-        ([2.0, 2.0, 2.0], [2.0, 2.0, 2.0], "there is no spread to test against"),
+        ([2.0, 2.0, 2.0], [2.0, 2.0, 2.0], "there is no spread"),
     ],
 )
 def test_what_cannot_be_tested_is_refused_in_one_line(test, a, b, said):
@@ -532,7 +532,7 @@ def test_a_sample_without_spread_is_named(test):
         ({"a": [1, 2, 3], "b": [1, 2, 3]}, "at least 3 models, got 2"),
         ({"a": [1, 2, 3], "b": [1, 2, 3], "c": [1, 2]}, "'c' has 2 runs"),
         ({"a": [1, 2, 3], "b": [1, 2, 3], "c": [1, 2, 3, 4]}, "every model in every repeat"),
-        ({name: [1, 2, 3] for name in "abc"}, "all 3 models score alike in each of 3 repeats"),
+        ({name: [1, 2, 3] for name in "abc"}, "all 3 models score equally in each of 3 repeats"),
         ({"a": [1, 2, math.nan], "b": [1, 2, 3], "c": [1, 2, 4]}, "'a' holds nan at place 2"),
     ],
 )
@@ -544,8 +544,8 @@ def test_friedman_refuses_what_cannot_be_ranked(scores, said):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: thesis_test(DRUG_1, DRUG_2, alpha=5), "alpha must lie between 0 and 1, got 5"),
-        (lambda: paired_comparison(DRUG_1, DRUG_2, confidence=95), "confidence must lie between"),
+        (lambda: thesis_test(DRUG_1, DRUG_2, alpha=5), "alpha must be between 0 and 1, got 5"),
+        (lambda: paired_comparison(DRUG_1, DRUG_2, confidence=95), "confidence must be between"),
         (lambda: hedges_g(DRUG_1, DRUG_2, form="paired"), "unknown form of Hedges' g 'paired'"),
         (lambda: hedges_g(DRUG_1, DRUG_2, resamples=10), "at least 100, got 10"),
         (lambda: critical_difference(1, 10), "expected at least 2 of each"),

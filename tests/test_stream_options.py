@@ -329,7 +329,7 @@ def test_a_jump_may_be_ruled_out_or_be_an_error() -> None:
 
 @pytest.mark.parametrize(("limit", "longest"), [(None, 2.0), (0.5, 0.5)])
 @pytest.mark.parametrize("option", ["saturate", "reset"])
-def test_long_gaps_are_counted_and_may_begin_anew(
+def test_long_gaps_are_counted_and_may_reset(
     option: str, limit: float | None, longest: float
 ) -> None:
     stream = Recorded(long_gap=option, long_gap_s=limit)

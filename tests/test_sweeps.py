@@ -13,10 +13,10 @@ import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.models.zoo import train_config
 from offbeat.sweeps.engines import local
-from offbeat.sweeps.fingerprint import walks
+from offbeat.sweeps.fingerprint import random_walks
 from offbeat.sweeps.record import Record
 
-DATA = walks(24, 30, 2)
+DATA = random_walks(24, 30, 2)
 SPLIT = ob.SplitConfig(window=12, observed_fraction=0.5, seed=3)
 SIZE = {"hidden_size": 4, "field_units": (8,), "decoder_units": (8,)}
 MODELS = {
@@ -97,7 +97,7 @@ def test_a_sweep_can_be_continued_with_more_models_and_repeats(done, tmp_path):
         ({"split": replace(SPLIT, window=11)}, "another sweep: split"),
         ({"scaler": "min_max"}, r"another sweep: scaler \('standardise' then, 'min_max' now\)"),
         ({"epochs": 3}, "another sweep: model gru"),
-        ({"dataset": walks(24, 31, 2)}, "a sweep of other trajectories"),
+        ({"dataset": random_walks(24, 31, 2)}, "a sweep of other trajectories"),
         ({"models": ["gru", "gru"]}, "labels that differ, got gru, gru"),
         ({"models": {"a/b": "gru"}}, "'a/b' names a folder"),
         ({"training": {"grru": ob.TrainConfig()}}, "did you mean 'gru'"),
@@ -118,9 +118,9 @@ def test_another_sweep_in_the_same_folder_and_bad_options_are_refused(done, chan
 SCRIPT = """
 import sys
 import offbeat as ob
-from offbeat.sweeps.fingerprint import walks
+from offbeat.sweeps.fingerprint import random_walks
 if __name__ == "__main__":
-    ob.sweep(walks(24, 30, 2), ["gru", "ode_rnn"], out=sys.argv[1], repeats=2, epochs=30,
+    ob.sweep(random_walks(24, 30, 2), ["gru", "ode_rnn"], out=sys.argv[1], repeats=2, epochs=30,
              split=ob.SplitConfig(window=12, observed_fraction=0.5), processes=2)
 """
 

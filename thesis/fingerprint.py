@@ -9,7 +9,7 @@ from functools import cache
 from offbeat.data.scaler import Scaler
 from offbeat.evaluation import evaluate
 from offbeat.models.zoo import make_model
-from offbeat.sweeps.fingerprint import digest, walks
+from offbeat.sweeps.fingerprint import digest, random_walks
 from offbeat.training import fit
 from thesis.protocol import CONTROLS, MODELS, Protocol, Run
 from thesis.record import SCORINGS
@@ -41,7 +41,7 @@ def fingerprints(protocol: Protocol) -> dict[str, str]:
 
     The controls are left out: they consist of nothing that the others do not meet.
     """
-    recorded = walks(_TRAJECTORIES, _ROWS, _CHANNELS)
+    recorded = random_walks(_TRAJECTORIES, _ROWS, _CHANNELS)
     scaler = Scaler.fit(protocol.scaler, recorded)
     found, parts = dict[str, str](), None
     for label in [label for label in MODELS if label not in CONTROLS]:

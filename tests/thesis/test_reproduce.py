@@ -186,7 +186,7 @@ def test_a_full_disk_loses_nothing(done, tmp_path, here, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(execution, "write_json", write_json)
-        with pytest.raises(ob.OffbeatError, match=r"No space left.*the same command goes on"):
+        with pytest.raises(ob.OffbeatError, match=r"No space left.*the same command resumes"):
             reproduce(SMALL, out, progress=False)
     assert len(Record.read(out).runs) == 3  # each run writes config and scores
     assert numbers(reproduce(SMALL, out, progress=False).record) == numbers(Record.read(done))
@@ -236,7 +236,7 @@ def test_time_that_is_over_stops_the_experiment_and_the_rest_is_done_later(
         patch.setattr(session.time, "monotonic", lambda: float(next(clock)))
         first = reproduce(SMALL, out, budget_minutes=1, progress=False)
     assert 0 < len(first.record.runs) < len(SMALL.runs())
-    assert "goes on" in str(first)
+    assert "resumes" in str(first)
     whole = reproduce(SMALL, out, progress=False)
     assert numbers(whole.record) == numbers(Record.read(done))
     assert len(set(here.given)) == len(SMALL.runs())
@@ -512,7 +512,7 @@ def test_a_worker_that_is_killed_costs_nothing_but_time(engine, long_record, tmp
     finally:
         process.kill()
         process.wait()
-    assert f"the process that did {name} was ended" in said
+    assert f"the process of {name} was killed" in said
 
 
 def test_two_experiments_in_one_folder_are_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""The rule that combines two predictions of a value; closed forms on validation data."""
+"""The rule that combines two predictions of a value, fitted in closed form on validation data."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from offbeat.errors import InputError
 from offbeat.metrics import gap_groups
 
 GROUPS = 16
-"""Lengths are grouped at 1, 2, 4, ... times the median gap; longer ones are in the last group."""
+"""Upper ends of the groups of lengths, in median gaps; longer ones are in the last group."""
 
 SIDES = ("between", "after_last", "before_first")
 """Where a value is: between two observations of its channel, or outside all of them."""
 
 START: NDArray[np.float64] = np.array([[0.5, 0.5, 0, 0, 0], [0.0] * 5, [0.0] * 5])
-"""(sides, 5) the weights without any data."""
+"""(sides, 5) the weights without data."""
 
 RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-"""Strengths that are tried, as numbers of values."""
+"""Ridge strengths that are tried, as numbers of values."""
 
 PLAIN: dict[str, tuple[tuple[int, ...], int]] = {
     "line": ((0,), 3),
     "pchip": ((0,), 4),
     "hold": ((1, 2), 0),
 }
-"""What is tried beside them: sides it is for, and the only weight that is 1; no model is used."""
+"""Alternatives without a model: their sides, and the only weight that is 1."""
 
 FOLDS = 5
 """Folds of the validation trajectories, each left out once to choose the strength."""
@@ -40,13 +40,13 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class FillRule:
-    """The weights of the rule in `offbeat.answers.two_sided`, and what they were fitted to.
+    """The weights of the rule in `offbeat.answers.two_sided`, and properties of their fit.
 
     Attributes:
         gap_unit: s, the length of the shortest group.
         weights: (channels, sides, groups, 5) w1 to w5; outside, the first is v.
         counts: (sides, groups) masked values of the validation data.
-        chosen: per channel and side, how its weights were found: `start`, `ridge 30`, or one of
+        chosen: per channel and side, the origin of its weights: `start`, `ridge 30`, or one of
             `PLAIN`.
     """
 
@@ -75,7 +75,7 @@ class FillRule:
 
     @classmethod
     def start(cls, channels: int, gap_unit: float) -> FillRule:
-        """The rule without any data."""
+        """The rule without data."""
         weights = np.broadcast_to(START[:, None], (channels, len(SIDES), GROUPS, START.shape[1]))
         counts = np.zeros((len(SIDES), GROUPS), dtype=np.int64)
         return cls(gap_unit, weights, counts, (("start",) * len(SIDES),) * channels)
@@ -93,7 +93,7 @@ class FillRule:
         return np.asarray(self.weights[channels, side, group_of(length, self.gap_unit)])
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form; floats survive to the last bit."""
+        """JSON-like form; floats are exact."""
         return {
             "gap_unit_s": self.gap_unit,
             "chosen": [list(names) for names in self.chosen],
@@ -104,7 +104,7 @@ class FillRule:
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> FillRule:
         """The inverse of `to_dict`."""
-        counts = value["counts"] if "counts" in value else value["cells"]  # its name in 0.1
+        counts = value["counts"] if "counts" in value else value["cells"]  # the name in 0.1
         weights = np.array(value["weights"])
         return cls(value["gap_unit_s"], weights, np.array(counts), value["chosen"])
 
@@ -116,7 +116,7 @@ def group_of(length: _Array, unit: float) -> NDArray[np.int64]:
 
 
 class NormalEquations:
-    """Adds up the normal equations of the rule, trajectory by trajectory, and solves them.
+    """Accumulates the normal equations of the rule over trajectories, and solves them.
 
     Args:
         channels: number of channels.
@@ -146,8 +146,8 @@ class NormalEquations:
         """Adds the masked values of a trajectory.
 
         Args:
-            terms: (rows, channels, 5) what the weights multiply, scaled.
-            missed: (rows, channels) the errors that they are to correct, scaled.
+            terms: (rows, channels, 5) regressors of the weights, scaled.
+            missed: (rows, channels) the errors to correct, scaled.
             side: (rows, channels) index into `SIDES`.
             length: (rows, channels) s.
             counted: (rows, channels) which values are masked and known.
@@ -168,9 +168,9 @@ class NormalEquations:
     def rule(self) -> FillRule:
         """The weights; per channel and side, those with the least error on trajectories left out.
 
-        Where channels are taken together, each is divided by the size of the errors that its
-        weights correct: else the noisiest ones would decide for all. Values of one gap are much
-        alike, so fewer than `FOLDS` trajectories decide nothing: there the strongest ridge is used
+        Where channels are pooled, each is divided by the size of the errors that its
+        weights correct; otherwise the noisiest ones would dominate. Values of one gap are
+        correlated, so with fewer than `FOLDS` trajectories the strongest ridge is used
         between observations, and `START` outside.
         """
         size = self._square.sum((0, 3)) / np.maximum(self._counts.sum((0, 3)), 1)
@@ -202,7 +202,7 @@ class NormalEquations:
         return self._solved(slice(None), ridge, relative), error
 
     def _plain(self, sides: tuple[int, ...], weight: int) -> tuple[_Array, _Array]:
-        """Weights that are one predictor alone, and (channels, sides) its squared errors."""
+        """Weights of a single predictor, and (channels, sides) its squared errors."""
         weights = np.zeros(self._moment.shape[1:])
         weights[..., weight] = 1.0
         error = self._error(slice(None), weights)
@@ -246,7 +246,7 @@ class NormalEquations:
 def _ridge_solution(
     gram: _Array, moment: _Array, count: int, ridge: float, towards: _Array
 ) -> _Array:
-    """Least squares, shrunk towards given weights as if by `ridge` more values."""
+    """Least squares, shrunk towards given weights by a prior of `ridge` values."""
     if not count:
         return towards
     scale = ridge * np.diag(gram) / count

@@ -14,11 +14,11 @@ from offbeat.models.base import BaseModel
 
 
 def forecast(model: BaseModel, dataset: Dataset, horizons: ArrayLike) -> Dataset:
-    """Predicts what comes after the last row of each trajectory.
+    """Predicts each trajectory after its last row.
 
     Args:
         model: trained.
-        dataset: what was observed.
+        dataset: the observed data.
         horizons: s after the last row: one number, or several that increase strictly, above 0.
 
     Returns:

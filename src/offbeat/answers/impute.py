@@ -1,4 +1,4 @@
-"""Filling what was not observed, with one model or with a pair that fills from both sides."""
+"""Imputation of values that were not observed, causal or two-sided."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from offbeat.models.zoo import make_model
 from offbeat.training import FitResult, fit
 
 MODES = ("causal", "two_sided")
-"""Ways of filling: from the past alone, or from both sides."""
+"""Modes of imputation: from the past alone, or from both sides."""
 
 RULE_FILE = "two_sided.json"
-"""File of the rule in a run's folder; `backward` beside it is the run of the backward model."""
+"""File of the rule in a run's folder; the subfolder `backward` is the run of the backward model."""
 
 
 def impute(
@@ -49,16 +49,16 @@ def impute(
 
     Args:
         model: a trained model, or a pair from `fit_two_sided`.
-        dataset: what was observed.
+        dataset: the observed data.
         mode: `causal` or `two_sided`; by default two-sided where the model is a pair.
         seed: of the generator of self-feeding.
 
     Returns:
-        The trajectories, channels in the order of the model, in original units. No value is
+        The trajectories in original units, channels in the order of the model. No value is
         NaN; `observed` is True where it was measured, and False where it was filled.
 
     Raises:
-        InputError: other channels than the model's, or two-sided filling asked of a single model.
+        InputError: other channels than the model's, or two-sided filling with a single model.
     """
     forward = model.forward if isinstance(model, TwoSided) else model
     mode = mode or ("two_sided" if isinstance(model, TwoSided) else "causal")
@@ -129,7 +129,7 @@ def fit_two_sided(
         DivergenceError: as `fit`.
     """
     folder = Path(out) if out is not None else None
-    # What is reversed must be continuous already: a wrap is found from the past alone.
+    # Angles are unwrapped before the reversal, because wraps are detected from the past.
     train, validation = (model.transforms.apply(part) for part in (train, validation))
     ahead = fit(model, train, validation, config, out=folder, device=device, progress=progress)
     kind, options = (
@@ -168,7 +168,7 @@ def save_two_sided(pair: TwoSided, path: str | Path) -> None:
 
 
 def load_two_sided(path: str | Path) -> TwoSided:
-    """Reads what `save_two_sided` or a two-sided training wrote.
+    """Reads a pair that `save_two_sided` or a two-sided training wrote.
 
     Args:
         path: the folder.

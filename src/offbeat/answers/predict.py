@@ -27,10 +27,10 @@ def predict(
     seed: int = 0,
     size: int = 500,
 ) -> Dataset:
-    """Predicts each trajectory at any times, each from what was observed strictly before it.
+    """Predicts each trajectory at any times, from observations strictly before each time.
 
     The model's input transforms are applied to the data and undone on the predictions: an angle
-    that was given wrapped is predicted wrapped. A model of your own gets each time asked for as a
+    that was given wrapped is predicted wrapped. A registered model gets each requested time as a
     row in which nothing is observed.
 
     Args:
@@ -43,7 +43,7 @@ def predict(
         size: trajectories per batch.
 
     Returns:
-        One trajectory of predictions per trajectory, in original units, at the times asked for;
+        One trajectory of predictions per trajectory, in original units, at the requested times;
         its channels are in the order of the model.
 
     Raises:
@@ -66,7 +66,7 @@ def predict(
             _with_rows_at(t, at) for t, at in zip(part, asked[first : first + size], strict=True)
         ]
         batch = model.batch(replace(part, trajectories=tuple(t for t, _ in merged)))
-        # The same generator for each part, as if they were one batch.
+        # One generator for all parts, as if they were one batch.
         drawn = {"generator": torch.Generator().manual_seed(seed)} if model.needs_generator else {}
         with torch.inference_mode():
             scaled = model(batch, **drawn).mean.double().cpu().numpy()
@@ -85,7 +85,7 @@ def predict(
 
 
 def in_model_order(model: BaseModel, dataset: Dataset) -> Dataset:
-    """The data set with its channels in the order of the model; as it is where they differ.
+    """The data set with its channels in the order of the model; unchanged if the channels differ.
 
     Actions that the model does not know are left out.
     """
@@ -99,10 +99,10 @@ def increasing_seconds(value: ArrayLike, what: str) -> NDArray[np.float64]:
 
     Args:
         value: a number, or a list or array of numbers.
-        what: it is, for the message.
+        what: name of the value, for the message.
 
     Raises:
-        InputError: it is not; it is empty, not finite, or does not increase strictly.
+        InputError: it is not a number or list; it is empty, not finite, or not increasing.
     """
     try:
         array = np.atleast_1d(np.asarray(value))
@@ -135,20 +135,20 @@ def _times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
 
 
 def _check_any_time(model: BaseModel) -> None:
-    """A time asked for is a row in which nothing is observed; it must change no other prediction.
+    """Checks that a row in which nothing is observed changes no other prediction.
 
     Raises:
-        InputError: it would.
+        InputError: it would change one.
     """
     if not isinstance(model, Model):
         return
     for field, value, meaning in (
-        ("readout", "last_row", "predicts the next row, whenever it comes"),
-        ("update_rows", "every", "is changed by every row, and a time asked for is one more row"),
-        ("decay_rows", "every_row", "decays at every row, and a time asked for is one more row"),
-        ("time_input", "gap", "uses the gap since the row before, which a time asked for splits"),
-        ("clock", "first_row", "starts at the first row, and a time asked for can come before it"),
-        ("self_feeding", True, "draws a random number at every row, also at a time asked for"),
+        ("readout", "last_row", "predicts the next row at whatever time"),
+        ("update_rows", "every", "is changed by every row, and a requested time is one more row"),
+        ("decay_rows", "every_row", "decays at every row, and a requested time is one more row"),
+        ("time_input", "gap", "uses the gap since the row before, which a requested time splits"),
+        ("clock", "first_row", "starts at the first row, and a requested time can be before it"),
+        ("self_feeding", True, "draws a random number at every row, also at a requested time"),
     ):
         found = getattr(model.config, field)
         if found == value or (value is True and found):
@@ -161,7 +161,7 @@ def _check_any_time(model: BaseModel) -> None:
 def _with_rows_at(
     trajectory: Trajectory, times: NDArray[np.float64]
 ) -> tuple[Trajectory, NDArray[np.int64]]:
-    """The trajectory with a row at each of the times, new ones empty; and which rows they are."""
+    """The trajectory with a row at each of the times (new ones empty), and their indices."""
     union = np.union1d(trajectory.times, times)
     rows = np.searchsorted(union, times)
     if len(union) == trajectory.rows:

@@ -1,4 +1,4 @@
-"""Scores of fills and forecasts beside trivial predictors, on the same values, in their units."""
+"""Scores of fills, forecasts and trivial predictors on the same values, in their units."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from offbeat.metrics import gap_groups
 from offbeat.models.base import BaseModel
 
 OVERALL = "all, scaled"
-"""Name of the last line of a table: all channels, in units of their standard deviation."""
+"""Name of the last row of a table: all channels, in units of their standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ChannelScores:
     """RMSE of several predictors on the same values, per channel in its unit.
 
     Attributes:
-        task: what was predicted, for headings.
+        task: what is predicted, for headings.
         names: of the channels.
         units: of the channels.
         counts: per channel, how many values were scored.
@@ -49,7 +49,7 @@ class ChannelScores:
     trivial: tuple[str, ...]
 
     def table(self) -> str:
-        """A plain-text table, a line per channel, a column per predictor."""
+        """A plain-text table with a row per channel and a column per predictor."""
         predictors = list(self.rmse)
         lines = [["channel", "unit", "values", *predictors]]
         each = zip(self.names, self.units, self.counts, strict=True)
@@ -61,7 +61,7 @@ class ChannelScores:
         return tables.plain(lines)
 
     def verdict(self) -> str:
-        """Which predictor is best, in words, and where a trivial one is."""
+        """A sentence on the best predictor, and on channels where a trivial one is better."""
         ranked = sorted((v, name) for name, v in self.overall.items() if v == v)
         if not ranked:
             return f"{self.task}: nothing to score"
@@ -107,12 +107,12 @@ class ChannelScores:
 
 
 class ErrorSums:
-    """Adds up squared errors of predictors, trajectory by trajectory, on the same values.
+    """Accumulates squared errors of predictors over trajectories, on the same values.
 
     Args:
         names: of the channels.
         units: of the channels.
-        scale: (channels,) of each channel, in its unit, for the error over all channels.
+        scale: (channels,) in the unit of each channel, for the error over all channels.
     """
 
     def __init__(self, names: Sequence[str], units: Sequence[str], scale: ArrayLike) -> None:
@@ -127,7 +127,7 @@ class ErrorSums:
         predictions: Mapping[str, NDArray[np.float64]],
         counted: NDArray[np.bool_],
     ) -> None:
-        """Adds rows.
+        """Adds the errors of rows.
 
         Args:
             truth: (rows, channels) known where counted.
@@ -140,7 +140,7 @@ class ErrorSums:
             self._sums[name] = self._sums.get(name, 0.0) + squared.sum(axis=0)
 
     def scores(self, task: str, trivial: Sequence[str]) -> ChannelScores:
-        """The scores of everything added so far."""
+        """The scores of all rows added so far."""
         counts, total = self._counts, int(self._counts.sum())
         each = {
             name: tuple(
@@ -172,7 +172,7 @@ class ImputationScores:
     inside: tuple[tuple[float, ChannelScores], ...]
 
     def table(self) -> str:
-        """A table per channel, and one by length of the gap."""
+        """A table by channel, and one by length of the gap."""
         predictors = list(self.scores.rmse)
         lines = [["gap up to", "values", *predictors]]
         for up_to, scores in self.inside:
@@ -182,7 +182,7 @@ class ImputationScores:
         return self.scores.table() + (by_gap if self.inside else "")
 
     def verdict(self) -> str:
-        """Which predictor is best, in words, and in which gaps a trivial one is."""
+        """A sentence on the best predictor, and on gaps where a trivial one is better."""
         text = self.scores.verdict()
         lost = []
         for up_to, scores in self.inside:
@@ -231,7 +231,7 @@ def fills_of(
 def score_imputation(
     model: BaseModel | TwoSided, dataset: Dataset, *, seed: int = 0
 ) -> ImputationScores:
-    """Scores fills of all masked values, beside last value, linear interpolation and PCHIP.
+    """Scores fills of all masked values: the model, last value, linear interpolation and PCHIP.
 
     Every value that is known and masked counts, for every predictor.
 
@@ -272,14 +272,14 @@ def score_imputation(
 def score_forecast(
     model: BaseModel, dataset: Dataset, horizons: ArrayLike, *, targets: int = 20
 ) -> tuple[ChannelScores, ...]:
-    """Scores forecasts at fixed horizons, beside the last value and constant velocity.
+    """Scores forecasts at fixed horizons: the model, last value and constant velocity.
 
     For a row at time t and a horizon h, every predictor is given the rows up to t - h and predicts
     t; the values of that row which are known, and whose channel was observed by t - h, count.
 
     Args:
         model: trained.
-        dataset: masked values are not used, and scored like others.
+        dataset: masked values are not used as input, and are scored as well.
         horizons: s, above 0, strictly increasing.
         targets: rows per trajectory and horizon, evenly spaced among those that can be scored.
 
@@ -342,7 +342,7 @@ _Target = tuple[Trajectory, float, NDArray[np.float64], NDArray[np.bool_]]
 
 
 def _targets(trajectory: Trajectory, horizon: float, count: int) -> list[_Target]:
-    """Pasts, times to predict, the true values there, and which of them count."""
+    """Past rows, times to predict, true values, and which of them count."""
     times = trajectory.times
     rows = np.searchsorted(times, times - horizon * (1 - 1e-9), side="right")
     seen = np.logical_or.accumulate(trajectory.observed, axis=0)

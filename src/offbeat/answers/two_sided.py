@@ -1,15 +1,15 @@
-"""Filling from both sides: a forward model, a backward model, and a rule that combines them.
+"""Two-sided imputation: a forward model, a backward model, and a rule that combines them.
 
 The backward model is trained on trajectories reversed in time, so it predicts a value from what was
 observed strictly after it. Between two observations of a channel, x0 at t0 and x1 at t1, let
 s = (t - t0) / (t1 - t0), f(t) and b(t) the two predictions, and r_f = x1 - f(t1) and
-r_b = x0 - b(t0) their errors on arrival at the other side, which are known. The fill is
+r_b = x0 - b(t0) their known errors at the other end. The fill is
 
     (1 - s) f + s b
         + s (1 - s) (w1 (r_f + r_b) + w2 (1 - 2 s) (r_b - r_f) + w3 (f - b))
         + w4 (line - (1 - s) f - s b) + w5 (curve - (1 - s) f - s b)
 
-with the straight line through x0 and x1, and PCHIP through all that was observed of the channel.
+with the straight line through x0 and x1, and PCHIP through all observations of the channel.
 The first line is the inverse-variance weighting of two predictions whose error variances grow in
 proportion to the distance from their observation. The second corrects the known errors: with
 w1 = w2 = 1/2 and models that continue straight, the fill is the cubic Hermite interpolation with
@@ -22,9 +22,9 @@ observed gets the mean of both predictions.
 
 The weights are the least-squares solution on masked values of validation data: by length of the gap
 (outside, of the distance) and channel, shrunk by ridge regression towards those of all channels
-together, these towards those of all lengths, and these towards `fill_rule.START`. The strength of
-the ridge is, for each channel, the one with the least error on validation trajectories left out;
-where the line, PCHIP or the observed value alone is better, the channel gets that. Outside, fewer
+pooled, these towards those of all lengths, and these towards `fill_rule.START`. The strength of
+the ridge is, for each channel, the one with the least error in cross-validation over trajectories;
+where the line, PCHIP or the observed value alone is better, it is used. Outside, fewer
 than five validation trajectories with such a value keep `START`.
 """
 
@@ -47,7 +47,7 @@ from offbeat.models.base import BaseModel
 
 @dataclass(frozen=True, eq=False)
 class TwoSided:
-    """Two models of the same channels and the rule that combines their predictions.
+    """Two models of the same channels, and the rule that combines their predictions.
 
     Attributes:
         forward: predicts from what was observed before.
@@ -64,7 +64,7 @@ class TwoSided:
 
     def __post_init__(self) -> None:
         if (self.forward.names, self.forward.units) != (self.backward.names, self.backward.units):
-            raise InputError("the forward and the backward model must be of the same channels")
+            raise InputError("the forward and the backward model must have the same channels")
         if len(self.rule.weights) != self.forward.channels:
             raise InputError(
                 f"the rule is for {len(self.rule.weights)} channels, the models have "
@@ -76,7 +76,7 @@ def reversed_in_time(dataset: Dataset) -> Dataset:
     """Each trajectory from its end to its start, times counted from its last row.
 
     Args:
-        dataset: any trajectories; values are not changed, those of velocities neither.
+        dataset: any trajectories; values are not changed, not even the signs of velocities.
     """
     return replace(
         dataset,
@@ -122,7 +122,7 @@ def fit_rule(
     Args:
         forward: trained.
         backward: trained on reversed trajectories.
-        validation: where nothing of it is masked, 30 % of the values of each channel are, at
+        validation: if none of its values are masked, 30 % of the values of each channel are, at
             random.
         seed: of that mask, and of the generator of self-feeding.
     """
@@ -150,13 +150,13 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """What is known of each value from both sides; (rows, channels) each, in original units.
+    """Inputs of the rule for each value; (rows, channels) each, in original units.
 
     Attributes:
         side: index into `fill_rule.SIDES`.
         length: s, between the observations on both sides; outside, to the nearest one.
         base: the fill with weights 0.
-        terms: (rows, channels, 5) what the weights multiply.
+        terms: (rows, channels, 5) regressors of the weights.
     """
 
     side: NDArray[np.int64]

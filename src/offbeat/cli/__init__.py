@@ -1,1 +1,1 @@
-"""The subcommands: one file each, a function whose arguments are the options."""
+"""The subcommands: one file each, with a function whose arguments are the options."""

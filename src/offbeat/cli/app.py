@@ -1,7 +1,7 @@
 """The command `offbeat`: each subcommand is a function, its options are the function's arguments.
 
 Torch and everything else that is slow to import is imported inside the functions, so that
-`offbeat --help` answers at once.
+`offbeat --help` is fast.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ From simulation to a scored model:
   offbeat impute runs/hopper hopper.parquet filled.csv
   offbeat forecast runs/hopper hopper.parquet ahead.csv --horizons 0.05,0.1
 
-A log of your own begins with: offbeat inspect LOG
-Several models at once, compared: offbeat demo"""
+For a log of your own, start with: offbeat inspect LOG
+To compare several models: offbeat demo"""
 
 
 # The functions are not named after the commands: jsonargparse would find their namesakes in the
@@ -61,7 +61,7 @@ COMMANDS: dict[str, Any] = {
 }
 
 ALIASES = {"forecast": ("extrapolate",)}
-"""Other names of commands."""
+"""Aliases of commands."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,7 +80,7 @@ def run_commands(
 
     Args:
         commands: by name.
-        argv: what was typed after the program's name.
+        argv: arguments after the program's name.
         prog: the program's name.
         description: for its help.
     """
@@ -113,7 +113,7 @@ def run_commands(
         return _fail(str(error), 2)
     except RecursionError:
         return _fail("a value is nested too deeply", 2)
-    except BrokenPipeError:  # the reader of the output has gone, as `| head` does
+    except BrokenPipeError:  # the reader of the output closed the pipe, as `| head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (OffbeatError, OSError) as error:

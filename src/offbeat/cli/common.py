@@ -1,4 +1,4 @@
-"""What the subcommands share."""
+"""Functions that several subcommands use."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from offbeat.data.trajectory import Dataset
 
 READER_FILE = "reader.json"
-"""The file of a run with the options that its log was read with."""
+"""File in a run's folder with the options that its log was read with."""
 
 
 def say(result: Any, text: str, as_json: bool) -> None:
@@ -22,7 +22,7 @@ def say(result: Any, text: str, as_json: bool) -> None:
 
 
 def plain(config: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a config as JSON and YAML know them."""
+    """The fields of a config as types of JSON and YAML."""
     return {k: _lists(v) for k, v in config.items()}
 
 
@@ -69,10 +69,10 @@ def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str,
 
 
 def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) -> dict[str, Any]:
-    """The table that commands write: times, one column per channel, and what was observed of it.
+    """The table that commands write: times, one column per channel, and its observed mask.
 
     Args:
-        dataset: as it was read; its labels and its clock are put back.
+        dataset: as it was read; its labels and its clock are restored.
         answers: one trajectory per trajectory of the data set.
         masks: add a column `name|observed` per channel, true where the value was measured.
 
@@ -88,7 +88,7 @@ def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) ->
     seconds = np.concatenate([t.times for t in answers])
     columns: dict[str, Any] = {"trajectory": np.repeat(labels, each), "time": seconds}
     if "clock_start" in dataset.meta:
-        # An integer clock was read relative to its first row; this puts it back, to the tick.
+        # An integer clock was read relative to its first row; this restores it exactly.
         unit, start = dataset.meta["time_unit"], np.repeat(dataset.meta["clock_start"], each)
         ticks = seconds / SECONDS_PER[unit]
         columns[f"clock_{unit}"] = start + (ticks if unit == "s" else np.rint(ticks).astype(int))

@@ -29,7 +29,7 @@ def compare_command(
 
     For example: offbeat compare runs/gru-* runs/ode_rnn-* --baseline last_value. Runs are paired
     by repeat: train every model on the same splits of the data (--split.seed 0, 1, 2, ...), each
-    run in a folder of its own. At least three repeats are needed, ten are better.
+    run in a folder of its own. At least three repeats are needed; ten are better.
 
     Args:
         runs: folders of runs, folders that hold such folders, or tables with a row per run (.csv,

@@ -1,4 +1,4 @@
-"""Options of arguments that are mappings: how a log is read, and how a model is trained."""
+"""Options of arguments that are mappings: those of readers, and of trainings."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from offbeat.config import TrainConfig
 
 
 def training_options() -> list[Option]:
-    """The fields of `TrainConfig`; those that are not given are as in the model's recipe."""
+    """The fields of `TrainConfig`; by default those of the model's recipe."""
     return _fields(TrainConfig)
 
 
 def reader_options() -> list[Option]:
-    """What `offbeat.read` takes: `format`, the options of every format, and those of each."""
+    """Options of `offbeat.read`: `format`, those of all formats, and those of each."""
     from offbeat.data.readers import READERS
     from offbeat.data.recording import ReaderOptions
 
@@ -52,7 +52,7 @@ def _fields(config: type) -> list[Option]:
 
 
 def _described(documented: Any) -> dict[str, str]:
-    """What a docstring says of each argument or attribute, each on one line."""
+    """The description of each argument or attribute in a docstring, on one line."""
     text = inspect.getdoc(documented) or ""
     section = re.search(r"^(?:Args|Attributes):\n((?:(?: .*)?\n?)*)", text, re.MULTILINE)
     found = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section[1] if section else "", re.M)

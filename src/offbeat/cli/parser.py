@@ -1,8 +1,8 @@
 """The parser of a command: its options are the arguments of a function.
 
-Made of jsonargparse, with four rules of our own. A boolean option is a flag, which may also be
-given as `--flag=true` or `--flag=false`. A list may be typed as `a,b,c`. What is typed wins over
-what stands in a config, in any order. No value names a class or a function that is then called.
+Based on jsonargparse, with four additional rules. A boolean option is a flag, which may also be
+given as `--flag=true` or `--flag=false`. A list may be given as `a,b,c`. The command line overrides
+the config, in any order. No value can name a class or a function to call.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _RENAMED = {
 
 
 class Option(NamedTuple):
-    """An option without a default: only where it is given, it is in the mapping of its group."""
+    """An option without a default, which is in the mapping of its group only if given."""
 
     name: str
     type: Any
@@ -56,7 +56,7 @@ class Option(NamedTuple):
 
 
 class Formatter(DefaultHelpFormatter):
-    """Leaves the lines of the description as they are."""
+    """Keeps the line breaks of the description."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return "".join(indent + line for line in text.splitlines(keepends=True))
@@ -85,7 +85,7 @@ class CommandParser(ArgumentParser):
         self.function, self.groups_of, self.is_filled = function, groups or {}, False
 
     def fill(self) -> None:
-        """Adds the options of the function, once; the command that runs alone needs them."""
+        """Adds the options of the function; called only for the command that runs."""
         if self.is_filled or self.function is None:
             return
         self.is_filled = True
@@ -104,13 +104,13 @@ class CommandParser(ArgumentParser):
             elif re.search(r"\b(list|tuple|Sequence)\[", str(kind)):
                 if action.option_strings:
                     action.type = _Listed(kind)
-                else:  # any number of them, as a shell hands them over
+                else:  # any number of them, as a shell passes them
                     action._typehint, action.nargs, action.metavar = kind.__args__[0], "+", None
         paths = (action.dest for action in actions if not action.option_strings)
         self.usage = f"{self.prog} [options] {' '.join(paths)}"
 
     def _make_flag(self, option: argparse.Action) -> None:
-        """Lets an option of type bool stand alone, or with true or false."""
+        """Allows an option of type bool without a value, or with true or false."""
         option.nargs = 0
         (name,) = option.option_strings
         self._option_string_actions[name] = _Flag([name], option.dest, nargs="?", const="true")
@@ -120,7 +120,7 @@ class CommandParser(ArgumentParser):
             )
 
     def _match_argument(self, action: argparse.Action, pattern: str) -> int:
-        """How many of the strings that follow belong to an option; to a flag, true or false."""
+        """Number of the following strings that belong to an option; for a flag, true or false."""
         if isinstance(action, _Flag):
             following = self.args[len(self.args) - len(pattern) :][:1]
             return int(action.nargs == "?" and following in (["true"], ["false"]))
@@ -129,7 +129,7 @@ class CommandParser(ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None, **options: Any
     ) -> Namespace:
-        """Parses what was typed; values of a config count where nothing was typed."""
+        """Parses arguments; values of a config apply to options that are not given."""
         self.fill()
         if self.function is not None:
             try:
@@ -153,7 +153,7 @@ class CommandParser(ArgumentParser):
         except (OSError, UnicodeError, yaml.YAMLError) as error:
             raise ArgumentError(None, f"the config {path} can't be read: {error}") from None
         if not isinstance(values, dict):
-            raise ArgumentError(None, f"the config {path} must hold options by name")
+            raise ArgumentError(None, f"the config {path} must contain options by name")
         values = {name: value for name, value in values.items() if value is not None}
         for action in self._actions:
             if action.nargs == "+" and not isinstance(values.get(action.dest, []), list):
@@ -188,14 +188,14 @@ class CommandParser(ArgumentParser):
             near = difflib.get_close_matches(f"--{new}", known, n=1, cutoff=0.7)
             message += f"; did you mean {near[0]!r}?" if near else ""
         elif re.search("unrecognized arguments: [^-]", message, re.IGNORECASE):
-            message += "; all paths stand together" if "together" not in message else ""
+            message += "; give all paths together" if "together" not in message else ""
         message = message.replace(
-            "ignored explicit argument", "stands alone, or takes =true or =false, not"
+            "ignored explicit argument", "takes no value, =true or =false, not"
         )
         super().error(message, ex)
 
     def spoken(self, message: str) -> str:
-        """A message of the library in the words of the command line.
+        """Translates a message of the library to the options of the command line.
 
         `window_s=0.5` becomes `--split.window_s 0.5`, and a name at the start of the message the
         option.
@@ -218,7 +218,7 @@ class CommandParser(ArgumentParser):
 
 
 class _Config(ActionConfigFile):
-    """Read before what is typed, so there is nothing left to do for it."""
+    """Does nothing: the config is read before the other arguments."""
 
     def __call__(self, *_: Any) -> None:
         pass
@@ -232,7 +232,7 @@ class _Flag(argparse.Action):
 
 
 class _Listed:
-    """Takes a list as `a,b,c`, beside what YAML has for lists."""
+    """Takes a list as `a,b,c`, or as YAML."""
 
     def __init__(self, kind: Any) -> None:
         self.kind = kind
@@ -245,7 +245,7 @@ class _Listed:
 
 
 def _function_of(options: Sequence[Option]) -> Callable[..., None]:
-    """A function that has these options as its arguments, none of which has a default."""
+    """Makes a function with these options as arguments without defaults."""
 
     def function() -> None:
         pass
@@ -268,7 +268,7 @@ _load_yaml = get_loader("yaml")
 
 
 def _load(text: str) -> Any:
-    """As jsonargparse reads YAML, within the bounds of `safe_yaml`."""
+    """Reads YAML as jsonargparse does, within the limits of `safe_yaml`."""
     safe_yaml.check(text)
     value = _load_yaml(text)
     if value != text:

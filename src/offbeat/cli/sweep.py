@@ -9,7 +9,7 @@ from offbeat.cli.common import read_log, say
 from offbeat.config import SplitConfig
 
 MODELS = ("gru_d", "ode_rnn", "anchored_ode_gru_d")
-"""The models of a sweep that names none."""
+"""Models of a sweep by default."""
 
 
 def sweep_command(

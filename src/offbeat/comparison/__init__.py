@@ -1,4 +1,4 @@
-"""Any runs compared, not only those of one protocol; reads records, imports no torch."""
+"""Comparison of runs: reads records, tests differences; imports no torch."""
 
 from offbeat.comparison.comparing import compare
 from offbeat.comparison.results import Comparison, ConditionResult, PairResult, Summary

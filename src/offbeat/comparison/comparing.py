@@ -1,4 +1,4 @@
-"""Any runs compared: every model beside the others, condition by condition."""
+"""`compare`: compares the models of runs, condition by condition."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from offbeat.comparison.statistics.samples import Sample, check_level, equal
 from offbeat.comparison.statistics.two_samples import ThesisTest, shapiro_wilk, thesis_test
 from offbeat.errors import InputError, one_of
 
-_FEW = 20  # pairs; from so few, BCa intervals hold the truth visibly less often than they say
+_FEW = 20  # pairs; with fewer, BCa intervals cover the true value less often than stated
 
 Error = Literal["rmse", "mse"]
 
@@ -40,13 +40,13 @@ def compare(
     seed: int = 0,
     shared_repeats: bool = False,
 ) -> Comparison:
-    """Compares models over repeats: which differences are real, and how large.
+    """Compares models over repeats: which differences are significant, and how large.
 
     Runs are paired by repeat within a condition; the paired tests decide, with Holm's correction
-    over all pairs of all conditions. `docs/statistics.md` says what each test assumes.
+    over all pairs of all conditions. `docs/statistics.md` lists the assumptions of each test.
 
     Args:
-        runs: of `read_runs`, or what it reads: folders of runs, tables.
+        runs: from `read_runs`, or paths that it reads: folders of runs, tables.
         metric: `after_first_observation`, `masked`, `after_first_row` or `published`.
         error: compare root mean squared errors (as the thesis does), or mean squared errors.
         baseline: compare every model with this one; by default every model with every other.
@@ -57,7 +57,7 @@ def compare(
         confidence: of intervals.
         resamples: of the bootstrap.
         seed: of the bootstrap.
-        shared_repeats: leave out repeats that a model lacks, instead of refusing to go on.
+        shared_repeats: leave out repeats that a model lacks, instead of raising an error.
 
     Raises:
         InputError: too few runs or models, repeats that do not pair, an unknown name, a score that
@@ -81,7 +81,7 @@ def compare(
     if len(set(chosen)) < 2 or len(set(chosen)) < len(chosen):
         raise InputError(
             f"a comparison needs at least two different models, got: {', '.join(chosen)}; "
-            f"{LAST_VALUE!r} is one that every run brings along"
+            f"every run has {LAST_VALUE!r}"
         )
     notes: list[str] = []
     tables = paired_tables(scores, chosen, baseline, shared=shared_repeats, notes=notes)
@@ -193,13 +193,13 @@ def _provenance(compared: Iterable[Run]) -> list[str]:
 def _remarks(
     result: ConditionResult, scores: ScoreTable, family: int, alpha: float, notes: list[str]
 ) -> None:
-    """Adds what the number of runs does to the tests."""
+    """Adds notes on the limits that the number of runs sets to the tests."""
     n = len(result.repeats)
     floor = min(1.0, family * 2.0 ** (1 - n))
     if floor > alpha:
         notes.append(
             f"With {n} pairs and {family} comparisons Wilcoxon's adjusted p is at least "
-            f"{floor:.3g}: it can show no difference here"
+            f"{floor:.3g}: it cannot reach significance here"
         )
     if n < FEWEST_RESAMPLED:
         notes.append(
@@ -212,6 +212,6 @@ def _remarks(
         )
     if len(scores.draws[result.condition]) == 1:
         notes.append(
-            f"{result.condition}: all runs share one draw of windows and masks; what is found "
-            "holds for that draw"
+            f"{result.condition}: all runs share one draw of windows and masks; the results "
+            "hold for that draw only"
         )

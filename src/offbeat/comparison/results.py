@@ -1,4 +1,4 @@
-"""What a comparison of runs found."""
+"""Results of a comparison of runs."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class PairResult:
         second: label of the second, the baseline where there is one.
         paired: the tests that decide; differences are first minus second.
         paired_t_holm: p of the paired t test, adjusted for all pairs of the comparison.
-        wilcoxon_holm: p of Wilcoxon's test, likewise.
-        thesis: the thesis' rule, which takes the runs to be independent.
+        wilcoxon_holm: p of Wilcoxon's test, adjusted in the same way.
+        thesis: the thesis' rule, which assumes independent runs.
         better: label of the model that is better by `paired_t_holm` at level alpha; None where no
             difference is shown.
     """
@@ -65,8 +65,8 @@ class ConditionResult:
     """All models under one condition.
 
     Attributes:
-        condition: what was asked of the runs.
-        repeats: that all models share.
+        condition: name of the condition.
+        repeats: those that all models have.
         summaries: per model, the lowest mean first; the last-value predictor among them.
         pairs: each with the tests of its difference.
         friedman: of the models together; None for two.
@@ -81,7 +81,7 @@ class ConditionResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found, every number of it.
+    """The result of `compare`.
 
     Attributes:
         metric: scoring of the runs.
@@ -91,8 +91,8 @@ class Comparison:
         confidence: of intervals.
         resamples: of the bootstrap.
         seed: of the bootstrap.
-        conditions: in the order in which they were met.
-        notes: what a reader must know of the runs: other commits, conditions left out, ...
+        conditions: in order of appearance.
+        notes: remarks on the runs: other commits, conditions left out, ...
     """
 
     metric: str
@@ -107,23 +107,23 @@ class Comparison:
 
     @property
     def family(self) -> int:
-        """How many pairs Holm's correction is made for."""
+        """Number of pairs that Holm's correction covers."""
         return sum(len(condition.pairs) for condition in self.conditions)
 
     def text(self) -> str:
-        """Tables for a terminal."""
+        """Tables in plain text."""
         from offbeat.comparison.text import text
 
         return text(self)
 
     def markdown(self) -> str:
-        """Tables as GitHub shows them."""
+        """Tables in Markdown."""
         from offbeat.comparison.text import markdown
 
         return markdown(self)
 
     def latex(self) -> str:
-        """Tables for the package booktabs."""
+        """Tables in LaTeX, for the package booktabs."""
         from offbeat.comparison.text import latex
 
         return latex(self)

@@ -1,4 +1,4 @@
-"""Run folders and tables of runs on disk, read as they are."""
+"""Reads run folders and tables of runs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from offbeat import safe_yaml
 from offbeat.errors import FileFormatError, one_of
 
 METRICS = ("after_first_observation", "masked", "after_first_row", "published")
-"""The scorings of a run, `offbeat.metrics.SCORINGS`; repeated here to do without torch."""
+"""The scorings of a run, `offbeat.metrics.SCORINGS`; repeated here to avoid importing torch."""
 
 LAST_VALUE = "last_value"
-"""Name of the trivial predictor that is scored beside every run."""
+"""Name of the trivial predictor that is scored with every run."""
 
 _OLD = {
     "after_first_observation": "honest",
@@ -25,10 +25,10 @@ _OLD = {
     "scan_backend": "kernel_body",
     "split": "parts",
 }
-"""Names that version 0.1.0 wrote, and that the record of the thesis keeps."""
+"""Names of version 0.1.0, which the record of the thesis keeps."""
 
 PROVENANCE = ("commit", "bits", "cpu", "scan_backend", "torch")
-"""What runs that are compared should have in common; where they have not, it is said."""
+"""What compared runs should have in common; differences are noted."""
 
 _NEW = {
     **{f"{old}_mse": f"{name}_mse" for name, old in _OLD.items()},
@@ -43,20 +43,20 @@ _NOT_SETTINGS = ("seed", "checkpoint_every")
 
 @dataclass(frozen=True)
 class RawRun:
-    """A run before labels are made.
+    """A run before labels are assigned.
 
     Attributes:
         name: its folder, or its id in a table.
         model: name of the model.
-        condition: what was asked of it, by name.
-        shown: those of them that stand in every label.
+        condition: settings of the condition, by name.
+        shown: those of them that are part of every label.
         settings: of model and training, without seeds.
-        seeds: that differ between repeats; the first alone where it is enough.
-        choices: all that runs may be chosen by.
+        seeds: that differ between repeats; only the first where that is enough.
+        choices: values that runs can be selected by.
         mse: by metric, NaN where nothing counted.
         last_value_mse: by metric.
         draw: of windows and masks.
-        origin: of `PROVENANCE`, what is known.
+        origin: known values of `PROVENANCE`.
     """
 
     name: str
@@ -73,7 +73,7 @@ class RawRun:
 
 
 def read_raw(path: Path) -> list[RawRun]:
-    """Reads the runs that stand at a path.
+    """Reads the runs at a path.
 
     Args:
         path: folder of a run, folder of such folders or of a record, or a table.
@@ -91,11 +91,11 @@ def read_raw(path: Path) -> list[RawRun]:
         if inside:
             return [_read_folder(folder) for folder in inside]
         raise FileFormatError(
-            f"{path} is no finished run: it holds neither results.json nor a record of runs; "
+            f"{path} is not a finished run: it has neither results.json nor a record of runs; "
             "'offbeat train' writes results.json when it is done"
         )
     if not path.exists():
-        raise FileFormatError(f"{path} is not there; give the folder of a run, or a table of runs")
+        raise FileFormatError(f"{path} does not exist; give a folder or table of runs")
     one_of(f"suffix of {path.name}", path.suffix.lower(), (".csv", ".parquet"))
     return _read_table(path)
 
@@ -136,12 +136,13 @@ def _read_folder(folder: Path) -> RawRun:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise FileFormatError(
-            f"{folder} is no run of 'offbeat train' ({type(error).__name__}: {error}); train again"
+            f"{folder} is not a run of 'offbeat train' ({type(error).__name__}: {error}); "
+            "train again"
         ) from None
 
 
 def _named(values: Mapping[str, Any], name: str) -> Any:
-    """A value by its name, or by the name that version 0.1.0 gave it."""
+    """A value by its name, or by its name in version 0.1.0."""
     return values[name] if name in values else values[_OLD.get(name, name)]
 
 
@@ -205,7 +206,7 @@ def _read_table(path: Path) -> list[RawRun]:
 
 
 def read_rows(path: Path, text: Iterable[str]) -> list[dict[str, Any]]:
-    """The rows of a table as they stand in its file.
+    """Reads the rows of a table.
 
     Args:
         path: .parquet or .csv.
@@ -239,4 +240,4 @@ def _number(value: Any, where: str) -> float:
     try:
         return math.nan if value is None else float(value)
     except (TypeError, ValueError):
-        raise FileFormatError(f"{where}: {value!r} is no number, expected an error") from None
+        raise FileFormatError(f"{where}: {value!r} is not a number, expected an error") from None

@@ -1,4 +1,4 @@
-"""Finished runs, read from their folders or from a table: what `compare` takes."""
+"""`read_runs`: reads finished runs from their folders or from a table, for `compare`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Run:
         model: label of the model; runs with the same label are repeats of each other.
         condition: data, observed fraction, experiment. Only runs under the same
             condition are compared.
-        repeat: pairs the runs of different models: those of one repeat share windows and masks.
+        repeat: pairs the runs of different models; runs of one repeat share windows and masks.
         mse: mean squared error on the test part by metric, in scaled units; NaN where nothing
             counted.
-        last_value_mse: the same of the last-value predictor; empty where it is not known.
+        last_value_mse: that of the last-value predictor; empty where it is not known.
         draw: of windows and masks; runs with different weights may share one.
-        origin: of `PROVENANCE`, what is known.
+        origin: known values of `PROVENANCE`.
     """
 
     name: str
@@ -46,14 +46,14 @@ def read_runs(
     """Reads finished runs.
 
     A folder of `offbeat train` is a run: its model is the name in config.yaml, its condition the
-    data and how it was cut, its repeat the seed of the cut. Where several runs of a model share
+    data and its split, its repeat the seed of the split. Where several runs of a model share
     that seed, the seed of the weights pairs them. Runs of one name under one condition whose
-    settings differ get the settings into their label: `gru[hidden_size=32]`.
+    settings differ have the settings in their label: `gru[hidden_size=32]`.
 
     A table has a row per run, with columns `model`, `repeat` and `<metric>_mse` (such as
-    `masked_mse`), and as far as there are any `run_id`, `condition`, `data`, `experiment`,
+    `masked_mse`), and optionally `run_id`, `condition`, `data`, `experiment`,
     `observed_fraction`, `seed_draw`, `last_value_<metric>_mse`, `commit`, `bits`, `cpu`,
-    `scan_backend`, `torch`. Names that version 0.1.0 wrote are read as well.
+    `scan_backend`, `torch`. Names of version 0.1.0 are read as well.
 
     Args:
         paths: of folders of runs, of folders that hold such folders or a `record.parquet` or
@@ -68,14 +68,14 @@ def read_runs(
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     raws = [raw for path in given for raw in read_raw(Path(path))]
     for key, wanted in (only or {}).items():
-        one_of("name to choose runs by", key, {name for raw in raws for name in raw.choices})
+        one_of("name to select runs by", key, {name for raw in raws for name in raw.choices})
         raws = [raw for raw in raws if key in raw.choices and _same(raw.choices[key], wanted)]
     if not raws:
         chosen = ", ".join(f"{k}={v}" for k, v in (only or {}).items())
         raise InputError(
-            f"none of the runs has {chosen}; leave it out to see which there are"
+            f"none of the runs has {chosen}; leave it out to list the runs"
             if chosen
-            else "got no runs; give folders of runs, or a table (.parquet or .csv)"
+            else "no runs; give folders of runs, or a table (.parquet or .csv)"
         )
     return _label(raws)
 
@@ -91,7 +91,7 @@ def parse_only(text: str | None) -> dict[str, str]:
         name, equals, value = part.partition("=")
         if not (name.strip() and equals):
             raise InputError(
-                f"got {part!r} to choose runs by, expected name=value, as experiment=2"
+                f"got {part!r} to select runs by, expected name=value, as experiment=2"
             )
         chosen[name.strip()] = value.strip()
     return chosen

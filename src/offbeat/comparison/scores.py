@@ -1,4 +1,4 @@
-"""The scores of runs by condition, model and repeat: what pairs with what."""
+"""Tables of scores by condition, model and repeat, for paired tests."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class ScoreTable:
                 if not np.isclose(before, value, rtol=1e-6, atol=0):
                     raise InputError(
                         f"{run.condition}: the runs of {run.repeat} do not share their test part: "
-                        f"the last-value predictor scores {value:g} beside {run.name} and "
-                        f"{before:g} beside another; train them on the same windows and masks"
+                        f"the last-value predictor scores {value:g} with {run.name} and "
+                        f"{before:g} with another run; train them on the same windows and masks"
                     )
 
     @staticmethod
@@ -61,14 +61,14 @@ def paired_tables(
     shared: bool,
     notes: list[str],
 ) -> dict[str, tuple[tuple[str, ...], dict[str, Sample]]]:
-    """Finds what can be compared.
+    """Collects the scores that can be compared.
 
     Args:
         scores: of all runs.
         chosen: models to compare.
         baseline: model that must be there, or None.
         shared: leave out repeats that a model lacks.
-        notes: what was left out is added to it.
+        notes: receives remarks on what was left out.
 
     Returns:
         Per condition its repeats and, per model, the scores in their order.

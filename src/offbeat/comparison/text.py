@@ -1,4 +1,4 @@
-"""A comparison as text, Markdown, LaTeX and JSON; renders, computes nothing."""
+"""Renders a comparison as text, Markdown, LaTeX and JSON."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from offbeat.comparison.statistics.ranks import FriedmanResult
 from offbeat.comparison.statistics.samples import Estimate
 
 CAVEAT = (
-    "The thesis' rule takes the runs to be independent. Those of one repeat share windows and "
+    "The thesis' rule assumes independent runs. Those of one repeat share windows and "
     "masks, so the paired tests decide."
 )
 
@@ -22,12 +22,12 @@ _TESTS = {"two_sample_t": "two-sample t", "welch_t": "Welch"}
 
 @dataclass(frozen=True)
 class Grid:
-    """A small table of texts.
+    """A table of strings.
 
     Attributes:
         title: a sentence.
-        head: of the columns.
-        rows: one text per column each.
+        head: headings of the columns.
+        rows: each with one string per column.
     """
 
     title: str
@@ -36,7 +36,7 @@ class Grid:
 
 
 def text(comparison: Comparison) -> str:
-    """Tables for a terminal."""
+    """Tables in plain text."""
     parts = [_heading(comparison)]
     for condition in comparison.conditions:
         parts.append(f"{condition.condition}\n{'-' * len(condition.condition)}")
@@ -46,7 +46,7 @@ def text(comparison: Comparison) -> str:
 
 
 def markdown(comparison: Comparison) -> str:
-    """Tables as GitHub shows them."""
+    """Tables in Markdown."""
     parts = [_heading(comparison)]
     for condition in comparison.conditions:
         parts.append(f"## {condition.condition}")
@@ -181,7 +181,7 @@ def _ranks(found: FriedmanResult) -> str:
 
 def _finding(pair: PairResult) -> str:
     if pair.better is None:
-        return "no difference shown"
+        return "no significant difference"
     return f"{pair.better} is better"
 
 

@@ -1,1 +1,1 @@
-"""ONNX: a model's step as one file, and what runs it."""
+"""Export of a model's step to ONNX, and a stream that runs it."""

@@ -27,7 +27,7 @@ from offbeat.models.model import Model
 from offbeat.ode import tableau
 
 MOST_STEPS = 256
-"""Solver steps over one gap that are written out; a graph of more would be too large to load."""
+"""Maximum number of unrolled solver steps over one gap; a larger graph is slow to load."""
 
 
 def export_onnx(model: Model, path: str | Path) -> None:
@@ -44,11 +44,11 @@ def export_onnx(model: Model, path: str | Path) -> None:
 
     Args:
         model: trained.
-        path: .onnx file to write, whole or not at all.
+        path: .onnx file, written atomically.
 
     Raises:
         InputError: a model without a recurrent state or with actions; an adaptive solver, whose
-            number of steps no fixed graph can have; more than 256 steps over a gap; self-feeding,
+            number of steps is not fixed; more than 256 steps over a gap; self-feeding,
             which draws random numbers; or another suffix.
         MissingExtraError: onnx or onnxscript is not installed.
     """
@@ -86,7 +86,7 @@ def export_onnx(model: Model, path: str | Path) -> None:
 
 
 class StreamStep(nn.Module):
-    """One row of one trajectory: `model.forward`, from and to original units.
+    """`model.forward` for one row of one trajectory, from and to original units.
 
     Args:
         model: runs within `_traceable`.
@@ -119,12 +119,12 @@ class StreamStep(nn.Module):
             past = RecurrentState(**given)
             output = self.model(row, past=past)
             prediction = output.mean[:, 0].double() * self.scale + self.shift
-            # An output that is an input itself would be left out of the graph.
+            # An output that is also an input would be missing in the graph.
             return prediction, *(getattr(output.past, name).clone() for name in STATE)
 
 
 class _ExactNumbers(TorchFunctionMode):
-    """Makes tensors of Python numbers that float32 does not hold, as the exporter writes it."""
+    """Converts Python numbers that are inexact in float32 to tensors, for the exporter."""
 
     def __torch_function__(
         self,
@@ -176,7 +176,7 @@ def _quiet() -> Iterator[None]:
 
 
 def most_steps(model: Model) -> int:
-    """Solver steps over the longest gap that a model's time can have."""
+    """Number of solver steps over the longest gap of a model."""
     if model.spec.max_step is None:
         return model.spec.steps_per_gap
     longest = model.statistics.longest_elapsed * float(model.config.gap_limit or 1)
@@ -185,9 +185,9 @@ def most_steps(model: Model) -> int:
 
 
 def _record(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
-    """What a stream needs to know that is not in the graph."""
+    """The metadata that a stream needs besides the graph."""
     limit = float(model.config.gap_limit or 1)
-    finite = {  # JSON has no infinities: the runner knows the other initial values
+    finite = {  # JSON has no infinities: the runner sets the other initial values
         name: initial[name].tolist() for name in ("state", "last")
     }
     return {
@@ -214,7 +214,7 @@ def _check_exportable(model: Model) -> None:
         raise InputError("a model with actions cannot be exported; stream it with offbeat.Stream")
     if model.config.self_feeding:
         raise InputError(
-            "a model with self_feeding draws random numbers at every row, which no graph can; "
+            "a model with self_feeding draws random numbers at every row, which a graph cannot; "
             "train one without self_feeding to export it"
         )
     if not model.spec.field:

@@ -1,4 +1,4 @@
-"""`OnnxStream`: an exported model that takes messages as they arrive, without torch."""
+"""`OnnxStream`: runs an exported model on messages as they arrive, without torch."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at"
 
 
 class OnnxStream(LiveStream):
-    """A model that `export_onnx` wrote, that takes messages as they arrive: `Stream` without torch.
+    """Runs a model that `export_onnx` wrote on messages as they arrive, without torch.
 
     Args:
         path: the .onnx file.
@@ -62,7 +62,7 @@ class OnnxStream(LiveStream):
 
 
 class OnnxEngine(Engine):
-    """Runs the step of an ONNX file, on one thread; the step scales by itself.
+    """Runs the step of an ONNX file on one thread; the step includes the scaling.
 
     Args:
         path: the .onnx file.
@@ -101,7 +101,7 @@ class OnnxEngine(Engine):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Values go in as they are, in original units."""
+        """Dtype of values in original units."""
         return np.dtype(np.float64)
 
     def reserve(self, slots: int) -> None:
@@ -109,7 +109,7 @@ class OnnxEngine(Engine):
         self._slots = [{}] * slots
 
     def reset(self) -> None:
-        """Starts again."""
+        """Resets the state."""
         self._state = dict(self._initial)
 
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
@@ -119,7 +119,7 @@ class OnnxEngine(Engine):
         self._state = dict(zip(STATE, found, strict=True))
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The step with nothing measured, for each time; its state is not used."""
+        """Runs the step without measurements for each time; does not change the state."""
         feed = {"values": self._unmeasured, **self._state}
         each = [self._session.run(["prediction"], {"t": t[None], **feed})[0] for t in times]
         return np.concatenate(each)
@@ -137,16 +137,16 @@ class OnnxEngine(Engine):
         return {name: array.copy() for name, array in self._state.items()}
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes the inputs that are the state."""
+        """Restores the inputs that are the state."""
         self._state = dict(arrays)
 
     def fingerprint(self) -> str:
-        """Of the file."""
+        """Fingerprint of the file."""
         return self._digest
 
 
 def _read(record: Any) -> tuple[StreamInfo, Arrays]:
-    """What the metadata says: the info of the stream, and the state before anything is observed."""
+    """Reads the metadata: properties of the stream, and the initial state."""
     if record["format"] != FORMAT or record["version"] not in (1, VERSION):
         raise FileFormatError(
             f"the ONNX file is a {record['format']!r} of version {record['version']!r}, this "

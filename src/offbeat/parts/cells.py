@@ -1,6 +1,6 @@
-"""Cells: what an observation does to the hidden state h.
+"""Cells: the update of the hidden state h by an observation.
 
-A cell is one class: its weights, and a step. The simplest one overrides `new`:
+A cell is a class with weights and a step. The simplest one overrides `new`:
 
     class Leaky(Cell):
         def new(self, gates, h):
@@ -23,7 +23,7 @@ from offbeat.registry import Registry
 
 
 class Cell(nn.Module):
-    """A cell that projects its inputs once and steps from them.
+    """A cell that projects its inputs for all steps at once.
 
     Args:
         inputs: width of the input: observed values, mask and times since observation.
@@ -43,11 +43,11 @@ class Cell(nn.Module):
     gates_per_unit: ClassVar[int] = 1
     """Width of the input projection for each unit of h."""
     memory_per_unit: ClassVar[int] = 0
-    """Further units of state for each unit of h."""
+    """Number of memory units for each unit of h."""
     is_recurrent: ClassVar[bool] = True
-    """Whether there are weights of h; a cell without them overwrites it."""
+    """Whether h has recurrent weights; a cell without them overwrites h."""
     takes_reset_after: ClassVar[bool] = False
-    """Whether the option `reset_after` has a meaning."""
+    """Whether the option `reset_after` applies."""
 
     def __init__(
         self, inputs: int, hidden_size: int, *, innovation: int = 0, reset_after: bool = False
@@ -73,7 +73,7 @@ class Cell(nn.Module):
         Args:
             gates: (batch, gates) the projected input.
             state: (batch, hidden + memory) h, and the memory of a cell that has one.
-            update: (batch, 1) 1.0 where the cell acts, 0.0 where the state stays exactly as it is.
+            update: (batch, 1) 1.0 where the cell acts, 0.0 where the state does not change.
         """
         return torch.lerp(state, self.new(gates, state), update)
 
@@ -97,12 +97,12 @@ class Cell(nn.Module):
 
 
 class Start(Cell):
-    """h becomes the projection of the input: a start value, where there is no recurrent cell."""
+    """Replaces h by the projection of the input, for models without a recurrent cell."""
 
     is_recurrent = False
 
     def new(self, gates: Tensor, state: Tensor) -> Tensor:
-        """The projection itself."""
+        """Returns the projection."""
         return gates
 
 
@@ -152,7 +152,7 @@ class GRU(Cell):
 
 
 CELLS: Registry[type[Cell]] = Registry("cell", group="offbeat.cells")
-"""Cells by the name that `ModelConfig.cell` takes; `none` stands for `start`."""
+"""Cells by the name that `ModelConfig.cell` takes; `none` is an alias of `start`."""
 
 for _name, _cell in {"start": Start, "elman": Elman, "lstm": LSTM, "gru": GRU}.items():
     CELLS.register(_name, _cell)

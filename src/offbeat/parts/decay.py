@@ -1,6 +1,6 @@
-"""Decays: how h decays with time, and how a last value decays to the training mean.
+"""Decays of h over time, and of the last value to the training mean.
 
-They hold the weights. The exponents are computed inside the scan, from times since observation.
+The classes contain the weights. The scan computes the exponents from times since observation.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class ExponentialDecay(nn.Module):
 
 
 class InputDecay(nn.Module):
-    """x-hat of equation 27: the last value, decaying to the mean with a diagonal gamma_x.
+    """x-hat of equation 27: the last value decays to the mean with a diagonal gamma_x.
 
     Args:
         channels: number of channels.

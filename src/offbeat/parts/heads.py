@@ -1,4 +1,4 @@
-"""Heads: from a state to a prediction, and the loss of that prediction."""
+"""Heads: map a state to a prediction, and define the loss of the prediction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from offbeat.registry import Registry
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a model expects at each row, in scaled units.
+    """A prediction of a model for each row, in scaled units.
 
     Attributes:
         mean: (batch, rows, channels).
@@ -29,7 +29,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class HeadShape:
-    """What a head is made for.
+    """Sizes and statistics that a head is built from.
 
     Attributes:
         channels: width of the prediction.
@@ -51,13 +51,13 @@ class HeadShape:
 
 
 class Head(nn.Module):
-    """Base class of heads. A head of one's own overrides `decode`, and `loss` where it differs.
+    """Base class of heads. A subclass overrides `decode`, and `loss` where it differs.
 
     Args:
-        shape: what it is made for.
+        shape: sizes and statistics.
 
     Attributes:
-        size: numbers per row that a decoder of this head has.
+        size: decoder outputs per row.
     """
 
     mean: Tensor
@@ -69,8 +69,8 @@ class Head(nn.Module):
         self.anchored = shape.anchored
         self.register_buffer("mean", shape.mean, persistent=False)
         self.register_buffer("std", shape.std, persistent=False)
-        # An observation sets the channels that it has, and only h learns of it: what to do about it
-        # is read off x and h together.
+        # An observation sets its channels of x, and only h is updated with weights: actions
+        # are decoded from x and h together.
         self.actions, self.policy = list(shape.actions), None
         if shape.anchored and shape.actions:
             width = shape.channels + shape.hidden_size
@@ -85,7 +85,7 @@ class Head(nn.Module):
 
         Args:
             prediction: of (batch, rows, channels).
-            target: (batch, rows, channels) scaled units; any finite number where it is not known.
+            target: (batch, rows, channels) scaled units; any finite number where it is unknown.
             mask: (batch, rows, channels) 1.0 where the target counts, else 0.0; None: all count.
         """
         if mask is None:
@@ -95,7 +95,7 @@ class Head(nn.Module):
 
     @property
     def layers(self) -> tuple[tuple[Tensor, Tensor], ...]:
-        """Weight and bias of each layer of the decoder; empty where the state is read as it is."""
+        """Weight and bias of each layer of the decoder; empty if the state is the prediction."""
         return ()
 
     def hidden(self, state: Tensor) -> Tensor:
@@ -147,7 +147,7 @@ class Gaussian(Head):
     """
 
     SMALLEST = 1e-4
-    """Least standard deviation, scaled units: the likelihood of a constant channel is bounded."""
+    """Minimum standard deviation, scaled units; bounds the likelihood of constant channels."""
 
     def __init__(self, shape: HeadShape) -> None:
         super().__init__(shape)
@@ -174,7 +174,7 @@ class Gaussian(Head):
 
 
 HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
-"""What `Gaussian.loss` leaves out of the negative log-likelihood of one entry."""
+"""The constant per entry that `Gaussian.loss` omits from the negative log-likelihood."""
 
 HEADS: Registry[type[Head]] = Registry("head", group="offbeat.heads")
 """Heads by the name that `ModelConfig.head` takes."""

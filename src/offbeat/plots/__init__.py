@@ -1,1 +1,1 @@
-"""Figures. They draw what they are given."""
+"""Figures."""

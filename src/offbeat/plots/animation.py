@@ -1,8 +1,8 @@
-"""An animation of a robot beside its prediction, rendered by MuJoCo.
+"""Animations of a robot next to its prediction, rendered by MuJoCo.
 
-MuJoCo chooses how it talks to the graphics hardware when it is imported, and a choice that does not
-work can end the process. So rendering runs in a process of its own, once per choice until one
-works; nothing of it reaches the process that asks.
+MuJoCo selects its rendering backend when it is imported, and a backend that does not
+work can kill the process. So rendering runs in a separate process, once per backend until one
+works.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def side_by_side(
 ) -> Path:
     """Writes a GIF of the true robot and the predicted one, one frame per row.
 
-    The true one also stands, transparent, behind the predicted one. The camera looks from the side
+    A transparent copy of the true one is behind the predicted one. The camera looks from the side
     and follows the true torso in both views. Below, a line of time shows which rows were observed.
 
     Args:
@@ -59,14 +59,14 @@ def side_by_side(
         predicted_qpos: (rows, nq) the same, predicted.
         path: of the GIF, written atomically.
         times: (rows,) s, strictly increasing; frames last as long as the rows, slowed down.
-        observed: (rows,) bool, what the model was shown; by default every row.
+        observed: (rows,) bool, rows that the model observed; by default every row.
         labels: what the left and the right view show.
-        caption: what is predicted by what, and how; stands above.
-        speed: 1/8 plays eight times slower than life.
+        caption: text above the views: what is predicted, by which model, and how.
+        speed: 1/8 plays eight times slower than real time.
 
     Raises:
         InputError: shapes disagree, values are not finite, or frames would be too short to show.
-        MissingExtraError: mujoco or dm_control is not installed, or no way of rendering works.
+        MissingExtraError: mujoco or dm_control is not installed, or no rendering backend works.
     """
     model = load_model(robot)
     truth = _positions("truth_qpos", truth_qpos, model.nq)
@@ -79,7 +79,7 @@ def side_by_side(
             f"{len(predicted)}, {len(clock)} and {len(seen)} rows"
         )
     durations = _durations_ms(clock, speed)
-    views = _render_somehow(robot, truth, predicted)
+    views = _render_any(robot, truth, predicted)
     frames = []
     for row in range(len(clock)):
         status = f"t = {1e3 * (clock[row] - clock[0]):.0f} ms    {_fraction(speed)} speed"
@@ -101,14 +101,14 @@ def stills(robot: str, qpos: ArrayLike) -> NDArray[np.uint8]:
 
     Raises:
         InputError: `qpos` is not finite or of another shape.
-        MissingExtraError: mujoco or dm_control is not installed, or no way of rendering works.
+        MissingExtraError: mujoco or dm_control is not installed, or no rendering backend works.
     """
     positions = _positions("qpos", qpos, load_model(robot).nq)
-    return _render_somehow(robot, positions, positions)[:, 0]
+    return _render_any(robot, positions, positions)[:, 0]
 
 
 def render_frames(request: str, answer: str) -> None:
-    """Renders what `request` asks for; runs in a process whose `MUJOCO_GL` is set.
+    """Renders a request; runs in a process whose `MUJOCO_GL` is set.
 
     Args:
         request: npz file with `robot`, `truth` (rows, nq) and `predicted` (rows, nq).
@@ -119,7 +119,7 @@ def render_frames(request: str, answer: str) -> None:
         model = load_model(str(asked["robot"]))
         truth, predicted = asked["truth"], asked["predicted"]
     _brighten(mujoco, model)
-    model.vis.quality.shadowsize = 1024  # a third of the time goes into larger ones
+    model.vis.quality.shadowsize = 1024  # larger ones take a third of the time
     states = [mujoco.MjData(model) for _ in range(2)]
     torso = _torso_path(mujoco, model, states[0], truth)
     camera = mujoco.MjvCamera()
@@ -138,18 +138,18 @@ def render_frames(request: str, answer: str) -> None:
             camera.lookat[:] = (torso[row, 0], torso[row, 1], height)
             for side, state in enumerate(states):
                 renderer.update_scene(state, camera)
-                # A moving reflection doubles the size of the file and says nothing.
+                # A moving reflection doubles the size of the file.
                 renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
                 if side:
                     _add_ghost(mujoco, model, states[0], renderer.scene)
                 renderer.render(out=frames[row, side])
     finally:
-        renderer.close()  # at exit it is too late, EGL is gone
+        renderer.close()  # EGL is not available any more at exit
     np.save(answer, frames)
 
 
 def _brighten(mujoco: Any, model: Any) -> None:
-    """Paints the sky plain and the floor pale: stars cost colours, robots stand out more."""
+    """Makes the sky plain and the floor pale: fewer colours, and a clearer robot."""
     for texture, kind in enumerate(model.tex_type):
         start, channels = int(model.tex_adr[texture]), int(model.tex_nchannel[texture])
         pixels = int(model.tex_height[texture] * model.tex_width[texture])
@@ -179,11 +179,11 @@ def _add_ghost(mujoco: Any, model: Any, data: Any, scene: Any) -> None:
 # --- a process that can render --------------------------------------------------------------------
 
 
-def _render_somehow(
+def _render_any(
     robot: str, truth: NDArray[np.float64], predicted: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     chosen = os.environ.get("MUJOCO_GL")
-    # Elsewhere than on Linux there is one backend, and MuJoCo finds it by itself.
+    # Other systems than Linux have one backend, which MuJoCo uses by default.
     backends = (chosen,) if chosen else ("egl", "osmesa") if sys.platform == "linux" else ("",)
     failures = []
     with tempfile.TemporaryDirectory(prefix="offbeat-") as folder:
@@ -204,10 +204,10 @@ def _render_somehow(
 
 
 def _render_with(backend: str, request: Path, answer: Path) -> str | None:
-    """Renders in a new process; returns None, or in a few words why it failed."""
+    """Renders in a new process; returns None, or why it failed."""
     code = "import sys; from offbeat.plots.animation import render_frames as r; r(*sys.argv[1:])"
     environment = {**os.environ, "MUJOCO_GL": backend}
-    # The child must find this very package, also where it is not installed.
+    # The child must import this copy of the package, even if it is not installed.
     here = str(Path(__file__).parents[2])
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH"))))
     try:
@@ -248,7 +248,7 @@ def _page(views: NDArray[np.uint8], labels: tuple[str, str], caption: str, statu
 
 
 def _timeline(page: Image, times: NDArray[np.float64], seen: NDArray[np.bool_], row: int) -> None:
-    """Draws a tick per row, tall and blue where observed, a cursor, and the state in words."""
+    """Draws a tick per row, tall and blue if observed, a cursor, and the status text."""
     from PIL import ImageDraw, ImageFont
 
     draw = ImageDraw.Draw(page)
@@ -269,7 +269,7 @@ def _timeline(page: Image, times: NDArray[np.float64], seen: NDArray[np.bool_], 
 
 
 def _write_gif(frames: list[Image], durations_ms: list[int], path: Path) -> Path:
-    """One palette for all frames: no flicker, and only what moves takes space."""
+    """Uses one palette for all frames, which avoids flicker and large files."""
     from PIL import Image
 
     sample = frames[:: max(1, len(frames) // 8)]
@@ -301,7 +301,7 @@ def _durations_ms(times: NDArray[np.float64], speed: float) -> list[int]:
             f"at speed {speed:g} a row of {gaps.min():g} s would be shown for less than "
             f"{_SHORTEST_FRAME_S:g} s; use a speed of at most {gaps.min() / _SHORTEST_FRAME_S:g}"
         )
-    # GIF counts hundredths of a second: round the ends, so that errors do not add up.
+    # GIF has units of 0.01 s: the ends are rounded, so that errors do not accumulate.
     ends = np.round((times - times[0]) / speed * 100).astype(int) * 10
     return [*np.diff(ends).tolist(), _HOLD_LAST_MS]
 

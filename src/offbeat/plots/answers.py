@@ -1,4 +1,4 @@
-"""A figure of fills and forecasts: what was observed, what was masked, what was answered."""
+"""A figure of fills and forecasts beside observed and masked values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LONGEST_LABEL = 24
-"""Characters of a channel's name and unit that fit beside a panel; longer ones stand above it."""
+"""Characters of a channel's name and unit that fit beside a panel; longer ones go above it."""
 
 
 def answers(
@@ -27,19 +27,19 @@ def answers(
     *,
     title: str = "",
 ) -> Figure:
-    """Draws channels over time: observed values, masked values, and what predictors put there.
+    """Draws channels over time: observed values, masked values, and the predictions of both.
 
-    A predictor is drawn where its `observed` is False: what it says of values that were measured is
-    no answer. Lines break where a value was observed.
+    A predictor is drawn where its `observed` is False; its values where something was measured
+    are not drawn. Lines break at observed values.
 
     Args:
-        truth: observed values are black, values that are known and masked are hollow.
-        answered: per predictor a trajectory on the same clock.
+        truth: observed values are black, known and masked values are hollow.
+        answered: per predictor, a trajectory on the same clock.
         channels: names of the channels to draw, one panel each.
-        title: stands above the panels.
+        title: text above the panels.
 
     Raises:
-        InputError: no channel is asked for, or one that a trajectory lacks.
+        InputError: no channel is given, or one that a trajectory lacks.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -110,7 +110,7 @@ def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], 
     label = f"{name} ({unit})" if unit else name
     if len(label) <= LONGEST_LABEL:
         axes.set_ylabel(label)
-    else:  # a topic's field, say: written along the axis it would run into the next panel
+    else:  # such as a field of a topic, which does not fit along the axis
         axes.set_title(label, loc="left", fontsize=8.5)
     axes.margins(x=0.01)
     together = np.concatenate(drawn)
@@ -123,7 +123,7 @@ def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], 
 def _with_ends(
     trajectory: Trajectory, at: int, truth: Trajectory, channel: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The line of a predictor: its answers, tied to the observed values beside them."""
+    """The line of a predictor: its values, joined to the observed values next to them."""
     times, values = trajectory.times, trajectory.values[:, at].copy()
     filled = ~trajectory.observed[:, at]
     beside = np.zeros(len(filled), dtype=bool)

@@ -1,4 +1,4 @@
-"""Figures of journal size. They draw what they are given, and touch no state of pyplot."""
+"""Figures of journal size, without the global state of pyplot."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _METADATA = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg":
 
 
 class LoggedEpoch(Protocol):
-    """What a figure reads of a line of a training log."""
+    """The fields of a training log's row that a figure reads."""
 
     @property
     def epoch(self) -> int:
@@ -34,7 +34,7 @@ class LoggedEpoch(Protocol):
 
     @property
     def validation_mse(self) -> float:
-        """In scaled units."""
+        """Validation error in scaled units."""
 
 
 def learning_curves(
@@ -51,7 +51,7 @@ def learning_curves(
         last_value_rmse: RMSE of the last-value predictor on the same validation part,
             drawn as a dashed horizontal line.
         x: count `epochs` or optimizer `steps`.
-        units: of the error, as the axis names them.
+        units: of the error, for the label of the axis.
 
     Raises:
         InputError: there is no model, or a log is empty.
@@ -68,7 +68,7 @@ def learning_curves(
     with rc_context(RC):
         figure = Figure(figsize=(_WIDTH, 3.6), layout="constrained")
         axes = figure.add_subplot()
-        # Best last value first, so that the legend reads like the table.
+        # Sorted by final value, as in the table.
         for name in sorted(histories, key=lambda n: histories[n][-1].validation_mse):
             history, style = histories[name], style_of(name)
             axes.plot(
@@ -89,7 +89,7 @@ def learning_curves(
         axes.set_xlabel("Epoch" if x == "epochs" else "Optimizer steps")
         axes.set_ylabel(f"Validation RMSE ({units})")
         axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
-        # An error seldom spans a decade: label 1, 2, 3, 5 of each, in plain numbers.
+        # Errors seldom span a decade: label 1, 2, 3 and 5 of each.
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
@@ -104,19 +104,19 @@ def predictions(
     *,
     title: str = "",
 ) -> Figure:
-    """Draws channels over time: the truth, what was observed of it, and what models predicted.
+    """Draws channels over time: the truth, its observed values, and predictions of models.
 
-    A panel is as high as the truth and the predictions after the channel's first observation need:
-    what a model says before it has seen anything may leave the panel.
+    A panel shows the full range of the truth and of the predictions after the channel's first
+    observation; earlier predictions may be outside.
 
     Args:
-        truth: with the observed values marked.
-        predictions: per model a trajectory of the same channels, on the same clock.
+        truth: with its observed values marked.
+        predictions: per model, a trajectory of the same channels on the same clock.
         channels: names of the channels to draw, one panel each.
-        title: stands above the panels.
+        title: text above the panels.
 
     Raises:
-        InputError: no channel is asked for, or one that a trajectory lacks.
+        InputError: no channel is given, or one that a trajectory lacks.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -186,9 +186,9 @@ def _channel(
 
 
 def save(figure: Figure, path: str | Path) -> Path:
-    """Writes a figure atomically, in the format that the suffix of `path` names.
+    """Writes a figure atomically, in the format of the suffix of `path`.
 
-    The same figure gives the same bytes: no dates are written.
+    The same figure gives the same bytes; no dates are written.
 
     Args:
         figure: to write.

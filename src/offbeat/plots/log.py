@@ -1,4 +1,4 @@
-"""A log at a glance: when each channel was measured, and how long it was between rows."""
+"""A figure of a log: when each channel was measured, and the time between rows."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 _WIDTH = 7.0  # inches, two columns of a journal
 _BINS = 1400
 _MOST_LANES = 40
-_USUAL = 1.5  # a time between values up to this many median ones is no gap
-_MARKED, _MOST_MARKS = 3.0, 50  # the longest gaps of more than this many median ones have a mark
+_USUAL = 1.5  # a time between values is a gap above this many median ones
+_MARKED, _MOST_MARKS = 3.0, 50  # the longest gaps above this many median ones are marked
 _MEASURED, _REPEATED, _GAP = "#0072B2", "#E69F00", "#D55E00"
 
 
 @dataclass(frozen=True)
 class _Lane:
-    """Channels that were always measured together, drawn as one."""
+    """Channels that are always measured together, drawn as one."""
 
     channels: tuple[int, ...]
     repeated: bool
@@ -35,18 +35,18 @@ class _Lane:
 def log(dataset: Dataset, inspection: Inspection, *, title: str = "") -> Figure:
     """Draws when each channel was measured, and the time between rows.
 
-    Above, a lane per channel, or per group of channels that were always measured together: full
-    colour where the channel's own rate is met, white where nothing was measured for longer than
-    1.5 times its median step. Its 50 longest gaps of more than 3 median steps are marked, for they
-    may be narrower than a dot of the picture. Episodes stand where the recording's clock has them,
-    with their outages marked, or one after the other where they have no clock in common.
+    Above, a lane per channel, or per group of channels that are always measured together: full
+    colour where the channel reports at its rate, white where it does not report for 1.5 times
+    its median step. Its 50 longest gaps of more than 3 median steps are marked, because they may be
+    narrower than a pixel. Episodes are at their times on the recording's clock, with
+    their outages marked, or one after the other if they have no common clock.
 
     Below, the longest time between two rows in each of 1400 equal intervals.
 
     Args:
-        dataset: as it was inspected.
-        inspection: of it.
-        title: stands above the panels.
+        dataset: the inspected data set.
+        inspection: of the data set.
+        title: text above the panels.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -104,16 +104,16 @@ def _short(name: str, most: int = 30) -> str:
 
 
 def _starts(dataset: Dataset) -> tuple[NDArray[np.float64], bool]:
-    """Where each episode begins on the axis, and whether all are on one clock.
+    """The start of each episode on the axis, and whether all are on one clock.
 
-    They are where the clocks that they began at follow each other, and the episodes do not fill
+    They are if their start clocks increase, and the episodes do not fill
     less than a tenth of the time that they span.
     """
     durations = np.array([t.times[-1] - t.times[0] for t in dataset])
     clocks = dataset.meta.get("clock_start", [])
     unit = SECONDS_PER[str(dataset.meta.get("time_unit", "s"))]
     if len(clocks) == len(dataset) and "labels" not in dataset.meta:
-        first = clocks[0]  # integers of nanoseconds keep their bits until they are small
+        first = clocks[0]  # exact subtraction of integers of nanoseconds
         starts = np.array([float(clock - first) * unit for clock in clocks])
         apart = (np.diff(starts) >= durations[:-1]).all()
         if apart and durations.sum() >= 0.1 * (starts[-1] + durations[-1]):
@@ -177,7 +177,7 @@ def _covered(
     starts: NDArray[np.float64],
     edges: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """(bins,) fraction of each bin in which the channel keeps to its rate."""
+    """(bins,) fraction of each bin in which the channel reports at its rate."""
     total = np.zeros(len(edges) - 1)
     width = edges[1] - edges[0]
     for trajectory, start in zip(dataset, starts, strict=True):
@@ -186,13 +186,13 @@ def _covered(
             continue
         at = at - trajectory.times[0] + start
         steps = np.diff(at)
-        # A value stands for the time up to the next one; before a gap, for one step.
+        # A value covers the time up to the next one; before a gap, one step.
         lasts = np.append(np.where(steps <= _USUAL * step, steps, np.minimum(steps, step)), 0.0)
         ends = at + lasts
         points = np.column_stack([at, ends]).ravel()
         sums = np.column_stack([np.append(0.0, np.cumsum(lasts)[:-1]), np.cumsum(lasts)]).ravel()
         total += np.diff(np.interp(edges, points, sums))
-        # One that is alone in its interval is seen all the same.
+        # A single value in a bin is visible too.
         place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, len(total) - 1)
         np.maximum.at(total, place, 0.25 * width)
     fraction: NDArray[np.float64] = np.clip(total / width, 0.0, 1.0)
@@ -202,7 +202,7 @@ def _covered(
 def _marks(
     dataset: Dataset, channel: int, step: float, starts: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Where the longest gaps begin, on the axis."""
+    """The starts of the longest gaps on the axis."""
     begins, lengths = [], []
     for trajectory, start in zip(dataset, starts, strict=True):
         at = trajectory.times[~np.isnan(trajectory.values[:, channel])]

@@ -24,7 +24,7 @@ def ranks_figure(results: FriedmanResult | Mapping[str, FriedmanResult]) -> Figu
     """Draws average ranks on a line, the best at the left, one panel per result.
 
     Demsar (2006), figure 1. A grey bar joins models that do not differ significantly by Nemenyi's
-    test; the bar at the top shows how far apart two average ranks must be.
+    test; the bar at the top shows the critical difference.
 
     Args:
         results: of `friedman`, one or several by title.
@@ -77,7 +77,7 @@ def _panel(
     for rank in range(1, models + 1):
         axes.plot((x(rank), x(rank)), (line, line + 0.06), color=_INK, linewidth=0.9)
         axes.text(x(rank), line + 0.09, str(rank), ha="center", va="bottom", color=_INK)
-    # The bar is as long as the critical difference, and the axis where that is longer.
+    # The bar is as long as the critical difference; the axis is at least as long.
     bar = (left, min(x(1 + result.critical_difference), right))
     axes.plot(bar, (line + 0.34,) * 2, color=_INK, linewidth=1.4, marker="|", label="_difference")
     axes.text(
@@ -127,12 +127,12 @@ def _panel(
 
 
 def _halves(result: FriedmanResult) -> tuple[list[str], list[str]]:
-    """Labels that stand at the left and at the right, each from the best to the worst."""
+    """Labels at the left and at the right, each from the best to the worst."""
     labels = [style_of(name).label for name in result.ranks]
     half = (len(labels) + 1) // 2
     return labels[:half], labels[half:]
 
 
 def _room(labels: list[str]) -> float:
-    """Inches beside the line that these labels need."""
+    """Width of the labels in inches."""
     return min(max(1.1, 0.75 + _LETTER * max(map(len, labels))), 2.9)

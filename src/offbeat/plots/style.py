@@ -1,4 +1,4 @@
-"""One look for every figure: a label, a colour and a dash per model, fixed once."""
+"""Styles of figures: a label, a colour and a dash per model."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Style:
-    """How one predictor is drawn, in every figure.
+    """How a predictor is drawn in every figure.
 
     Attributes:
         label: its name in legends and captions.
         colour: hexadecimal, from a palette for colour-blind readers.
         marker: of points.
-        dash: line style of matplotlib; with it, lines stay apart in black and white.
+        dash: line style of matplotlib; distinguishes lines in black and white.
     """
 
     label: str
@@ -30,7 +30,7 @@ _DASHED: Any = (0, (5, 1.5))
 _DASH_DOT: Any = (0, (5, 1.2, 1, 1.2))
 
 STYLES: dict[str, Style] = {
-    # The palette of Okabe and Ito (2008), then, for models met more rarely, that of Tol (2021).
+    # The palette of Okabe and Ito (2008), then, for rarer models, that of Tol (2021).
     "truth": Style("Truth", "#000000", ""),
     "last_value": Style("Last value", "#7F7F7F", "", (0, (4, 2))),
     "linear": Style("Linear", "#DDAA33", "", _DASHED),
@@ -52,13 +52,13 @@ STYLES: dict[str, Style] = {
     "gru_unfed": Style("GRU, not self-fed", "#44AA99", "o", _DOTTED),
     "gru_d_unfed": Style("GRU-D, not self-fed", "#CC6677", "s", _DASH_DOT),
 }
-"""The styles by id of the model; `truth` and `last_value` stand beside them."""
+"""Styles by id of the model, and those of `truth` and `last_value`."""
 
 _OTHERS = ("#117733", "#661100", "#6699CC")
 
 
 def style_of(name: str) -> Style:
-    """The style of a predictor; a name without an entry gets one that follows from the name."""
+    """The style of a predictor; for other names, one derived from the name."""
     if name in STYLES:
         return STYLES[name]
     return Style(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)], "o")
@@ -69,7 +69,7 @@ PAGE_WIDTH = 7.0
 """Widths of figures, one and two columns of a journal, inches."""
 
 INK = "#1A1A1A"
-"""Of text and axes."""
+"""Colour of text and axes."""
 
 RC: dict[Any, Any] = {
     "text.color": INK,
@@ -77,7 +77,7 @@ RC: dict[Any, Any] = {
     "axes.labelcolor": INK,
     "xtick.color": INK,
     "ytick.color": INK,
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
+    "font.family": "DejaVu Sans",  # included in matplotlib: the same figure on every machine
     "font.size": 9,
     "axes.labelsize": 9,
     "axes.titlesize": 9,
@@ -100,16 +100,16 @@ RC: dict[Any, Any] = {
     "pdf.fonttype": 42,  # text stays text
     "svg.fonttype": "none",
 }
-"""Settings of matplotlib, in force only while a figure is made or saved."""
+"""Settings of matplotlib, applied only while a figure is made or saved."""
 
 
 def plain_ticks(axis: Any, limits: tuple[float, float], *, times: float = 1.0) -> None:
-    """A few labels on a logarithmic axis, in plain numbers, also within one decade.
+    """Sets a few plain-number labels on a logarithmic axis, also within one decade.
 
     Args:
         axis: of matplotlib.
-        limits: between which it is seen.
-        times: labels are the values times this; the name of the axis has to say so.
+        limits: range of the axis.
+        times: factor of the labels, which the name of the axis must state.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 

@@ -1,1 +1,1 @@
-"""Streams: a trained model, live."""
+"""Streams: run a trained model on live messages."""

@@ -63,7 +63,7 @@ class CpuEngine(Engine):
 
     @staticmethod
     def unsupported(model: Model) -> str | None:
-        """Why this engine cannot run a model; None where it can.
+        """Why this engine cannot run a model; None if it can.
 
         Args:
             model: any.
@@ -77,16 +77,16 @@ class CpuEngine(Engine):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the model's weights."""
+        """Dtype of the model's weights."""
         return self._dtype
 
     def reserve(self, slots: int) -> None:
-        """Makes room for copies of the state."""
+        """Allocates slots for copies of the state."""
         self._live.reserve(slots)
         self._kept = [None] * slots
 
     def reset(self) -> None:
-        """Starts again, with the first random number."""
+        """Resets the state and the generator."""
         self._live.reset()
         self._generator = torch.Generator().manual_seed(self._seed) if self._fraction else None
 
@@ -99,7 +99,7 @@ class CpuEngine(Engine):
         self._live.observe(time, values, mask, fed)
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Each time by itself, from the state as it stands."""
+        """Predicts each time independently from the current state."""
         out = np.empty((len(times), self._model.channels))
         self._live.predict(times, out)
         return out
@@ -131,14 +131,14 @@ class CpuEngine(Engine):
         return arrays
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes the parts of a recurrent state."""
+        """Restores the parts of a recurrent state."""
         parts = [arrays[name].astype(np.float64).reshape(-1) for name, _, _ in self._parts()]
         self._live.restore(np.concatenate(parts))
         if self._generator is not None:
             self._generator.set_state(torch.tensor(arrays["generator"]))
 
     def fingerprint(self) -> str:
-        """That of `TorchEngine`: a state of the one can be restored in the other."""
+        """Equals that of `TorchEngine`: states can be exchanged between the two."""
         return TorchEngine(self._model).fingerprint()
 
     def _parts(self) -> list[tuple[str, tuple[int, ...], Any]]:

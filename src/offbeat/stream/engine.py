@@ -1,4 +1,4 @@
-"""What a stream needs of whatever runs the model: one row at a time, and saved states."""
+"""Interface of engines, which run a model one row at a time and save its states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 class Engine(ABC):
-    """Runs a model row by row: has the current state, and copies of earlier ones in slots.
+    """Runs a model row by row; has the current state, and copies of earlier states in slots.
 
     A method that raises leaves the state as it was.
     """
@@ -26,15 +26,15 @@ class Engine(ABC):
     @property
     @abstractmethod
     def dtype(self) -> np.dtype[Any]:
-        """Of the values that `observe` takes."""
+        """Dtype of the values that `observe` takes."""
 
     @abstractmethod
     def reserve(self, slots: int) -> None:
-        """Makes room for so many copies of the state, numbered from 0."""
+        """Allocates this many slots for copies of the state, numbered from 0."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Starts again: nothing observed yet."""
+        """Resets the state."""
 
     @abstractmethod
     def observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
@@ -48,7 +48,7 @@ class Engine(ABC):
 
     @abstractmethod
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predicts the next row, should it come at each of these times; the state stays as it is.
+        """Predicts the next row at each of these times; does not change the state.
 
         Args:
             times: (times,) s, none before the newest row.
@@ -71,7 +71,7 @@ class Engine(ABC):
 
     @abstractmethod
     def restore(self, arrays: Arrays) -> None:
-        """Takes the state that `export` gave; names, types and shapes have been checked."""
+        """Restores a state from `export`; names, types and shapes have been checked."""
 
     @abstractmethod
     def fingerprint(self) -> str:
@@ -79,7 +79,7 @@ class Engine(ABC):
 
 
 def encode(array: NDArray[Any]) -> dict[str, Any]:
-    """An array in JSON-like form: to the last bit, NaN and infinities included."""
+    """Encodes an array as JSON, exactly, including NaN and infinities."""
     array = np.ascontiguousarray(array)
     array = array.astype(array.dtype.newbyteorder("<"), copy=False)
     data = base64.b64encode(array.tobytes()).decode("ascii")

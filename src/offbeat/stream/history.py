@@ -1,4 +1,4 @@
-"""The newest rows of a stream, each with the state before it, so that late rows can be inserted."""
+"""The newest rows of a stream with the state before each, so that late rows can be inserted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Row(NamedTuple):
         time: s.
         values: (channels,) scaled; 0 where not measured.
         mask: (channels,) True where measured.
-        slot: of the engine, where the state before the row is kept.
+        slot: of the engine, with the state before the row.
     """
 
     time: float
@@ -30,7 +30,7 @@ class Row(NamedTuple):
 
 
 class History:
-    """Feeds rows to an engine, and returns it to its state before any of the newest rows.
+    """Feeds rows to an engine, and can restore its state before any of the newest rows.
 
     Args:
         engine: runs the model.
@@ -39,13 +39,13 @@ class History:
 
     def __init__(self, engine: Engine, kept: int) -> None:
         self._engine, self._kept = engine, kept
-        # The kept rows, as many again while they are replaced, one more, and one to go back to.
+        # The kept rows, the same number while they are replaced, one more, and one to restore.
         self._undo = 2 * kept + 1
         engine.reserve(self._undo + 1)
         self.forget()
 
     def forget(self) -> None:
-        """Drops all rows; the engine stays as it is."""
+        """Drops all rows; does not change the engine."""
         self.rows: list[Row] = []
         self._free = list(range(self._undo))
         self.floor = -math.inf
@@ -57,7 +57,7 @@ class History:
         return self.rows[-1].time
 
     def append(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
-        """The next row. If the engine raises, nothing has changed."""
+        """Appends the next row. If the engine raises, nothing changes."""
         slot = self._free[-1]
         self._engine.save(slot)
         self._engine.observe(time, values, mask)
@@ -67,16 +67,16 @@ class History:
             self._trim()
 
     def replace(self, i: int, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
-        """Other values for row i, as if they had come at once. If this raises, all is as before."""
+        """Replaces row i and repeats the later rows. If this raises, nothing changes."""
         self._run_again(i, (self.rows[i].time, values, mask), i + 1)
 
     def insert(self, i: int, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
-        """A row before row i, as if it had come in time. If this raises, all is as before."""
+        """Inserts a row before row i, repeats the later ones. If this raises, nothing changes."""
         self._run_again(i, (time, values, mask), i)
         self._trim()
 
     def place(self, time: float, within: float) -> tuple[int, bool] | None:
-        """Where a late row belongs: the row to join (True) or to stand before (False).
+        """Where a late row belongs: the row to join (True) or to precede (False).
 
         None: it belongs among rows that are no longer kept.
         """
@@ -105,7 +105,7 @@ class History:
         """The inverse of `record`.
 
         Raises:
-            InputError: the record is damaged. All is as before then.
+            InputError: the record is damaged. Nothing changes then.
         """
         like = self._engine.export()
         values, mask = np.zeros(channels, self._engine.dtype), np.zeros(channels, dtype=bool)
@@ -133,7 +133,7 @@ class History:
     def _run_again(
         self, i: int, row: tuple[float, NDArray[Any], NDArray[np.bool_]], rest: int
     ) -> None:
-        """From the state before row i on: `row`, then the rows from `rest` on."""
+        """Consumes `row` and the rows from `rest` on, from the state before row i."""
         again = [row, *((r.time, r.values, r.mask) for r in self.rows[rest:])]
         self._engine.save(self._undo)
         self._engine.load(self.rows[i].slot)

@@ -11,7 +11,7 @@ FIRST_US = 0.1
 
 
 class Latency:
-    """A histogram of durations, its bins equally wide in the logarithm: 4.7 % each."""
+    """A histogram of durations with logarithmic bins of 4.7 % each."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -29,7 +29,7 @@ class Latency:
     def quantile_us(self, fraction: float) -> float | None:
         """An upper bound, at most 4.8 % above the duration that this fraction does not exceed.
 
-        None while nothing was counted. Above 10 s it is the longest duration.
+        None if nothing was counted. Above 10 s, the longest duration.
         """
         if not self.count:
             return None
@@ -57,7 +57,7 @@ class Latency:
 
 
 def _edge_us(place: int) -> float:
-    """Upper end of a bin; the last one has none."""
+    """Upper edge of a bin; the last one is unbounded."""
     if place > BINS_PER_DECADE * DECADES:
         return math.inf
     return float(FIRST_US * 10 ** (place / BINS_PER_DECADE))

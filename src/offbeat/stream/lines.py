@@ -1,4 +1,4 @@
-"""A stream driven by JSON lines: every line is answered by one line, in order."""
+"""A stream driven by JSON lines; each line gets one line as its answer, in order."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LineSession:
         self.lines = self.bad_lines = 0
 
     def answer(self, line: bytes) -> bytes:
-        """The answer to a line, with its newline; empty for a blank one. Never raises on input."""
+        """Answers a line, newline included; empty for a blank one. Invalid input never raises."""
         self.lines += 1
         if not line.strip():
             return b""

@@ -1,4 +1,4 @@
-"""A stream of messages in any order, whatever runs the model."""
+"""A stream of messages in any order, for any engine."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VERSION = 2
 
 @dataclass(frozen=True)
 class StreamInfo:
-    """What a stream needs to know of its model.
+    """Properties of a model that a stream needs.
 
     Attributes:
         names: of the channels.
@@ -32,7 +32,7 @@ class StreamInfo:
         scaler: maps original units to those of the engine.
         median_gap: s, between the rows of the training set.
         elapsed_limit: s without an observation, at which the model's time saturates.
-        transforms: of the model.
+        transforms: input transforms of the model.
     """
 
     names: tuple[str, ...]
@@ -44,7 +44,7 @@ class StreamInfo:
 
 
 class LiveStream:
-    """Feeds messages to an engine, one row at a time; `Stream` and `OnnxStream` are public.
+    """Feeds messages to an engine, one row at a time; base of `Stream` and `OnnxStream`.
 
     Memory does not grow. Not thread-safe: calls must not overlap.
 
@@ -77,16 +77,16 @@ class LiveStream:
 
     @property
     def time_unit(self) -> str:
-        """Of all times given to this stream."""
+        """Unit of all times given to this stream."""
         return self._clock.unit
 
     @property
     def time(self) -> Time | None:
-        """Of the newest row, in the unit of the stream; None before the first."""
+        """Time of the newest row, in the unit of the stream; None before the first."""
         return self._placing.time
 
     def after(self, horizon_s: float) -> Time | None:
-        """The time so many seconds after the newest row; None before the first."""
+        """The time `horizon_s` after the newest row; None before the first."""
         rows = self._history.rows
         return self._clock.at(self._history.newest + horizon_s) if rows else None
 
@@ -97,17 +97,17 @@ class LiveStream:
 
     @property
     def pending(self) -> int:
-        """Messages that wait until it is clear whether the clock has jumped."""
+        """Number of messages that wait until it is clear whether the clock jumped."""
         return len(self._placing.pending)
 
     def observe(self, t: Time, values: Values, *, now: Time | None = None) -> Outcome:
-        """Takes what was measured at a time.
+        """Consumes the values measured at a time.
 
         Args:
             t: in the unit of the stream; an integer is exact.
             values: channel to value, or one value per channel, in original units. NaN, None and
                 channels that are left out were not measured.
-            now: what the clock says on arrival, for `stale_after_s`.
+            now: time of arrival, for `stale_after_s`.
 
         Returns:
             What was done with the message.
@@ -134,7 +134,7 @@ class LiveStream:
     def step(
         self, t: Time, values: Values, *, now: Time | None = None
     ) -> tuple[Outcome, NDArray[np.float64] | None]:
-        """Predicts a row, then takes it: `observe`, with the prediction that was made before it.
+        """Predicts a row, then observes it.
 
         Args:
             t: as in `observe`.
@@ -142,7 +142,7 @@ class LiveStream:
             now: as in `observe`.
 
         Returns:
-            What was done with the message; and where it is a `new` row, (channels,) predicted for
+            What was done with the message; and for a `new` row, (channels,) predicted for
             it in original units, one step ahead.
 
         Raises:
@@ -162,9 +162,9 @@ class LiveStream:
         return outcome, predicted[-1] if outcome == "new" else None
 
     def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
-        """Predicts the channels at a time, from all that was observed; the state stays as it is.
+        """Predicts the channels at a time from all observations; does not change the state.
 
-        It is the prediction of the batch pass for a row at this time, should it be the next one.
+        This is the prediction of the batch pass for a row at this time, if it is the next one.
         At the time of the newest row, the values of that row are known already. Several times are
         independent: each is predicted as if it were the only one.
 
@@ -188,11 +188,11 @@ class LiveStream:
         return predicted if several else predicted[0]
 
     def reset(self) -> None:
-        """Starts again: nothing observed yet. The counters go on."""
-        self._placing.begin_anew()
+        """Resets the state. The counters keep their values."""
+        self._placing.reset()
 
     def state(self) -> dict[str, Any]:
-        """All of the stream as JSON-like record; `restore` continues from it bit for bit."""
+        """State of the stream as a JSON-like record; `restore` continues from it bit for bit."""
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -202,7 +202,7 @@ class LiveStream:
         }
 
     def restore(self, record: dict[str, Any]) -> None:
-        """Continues from what `state` recorded. The options stay those of this stream.
+        """Continues from a record of `state`. The options of this stream are kept.
 
         Raises:
             InputError: the record is damaged, or of another model or time unit. The stream has not

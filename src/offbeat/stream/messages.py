@@ -1,4 +1,4 @@
-"""From messages to the input of a model: times to seconds, values to scaled rows."""
+"""Converts messages to the input of a model: times to seconds, values to scaled rows."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Values = Mapping[str, float | None] | ArrayLike
 """Channel to value, or one value per channel; NaN, None and what is left out was not measured."""
 
 _EXACT = 2.0**53
-"""From here on floats are further apart than 1."""
+"""From this number on, the spacing of floats is more than 1."""
 
 
 class Clock:
-    """Turns times of a unit into seconds since an origin.
+    """Converts times of a unit to seconds since an origin.
 
     A float64 cannot hold nanoseconds since 1970, so integers are subtracted as integers.
 
@@ -43,7 +43,7 @@ class Clock:
         self.origin: Time | None = None
 
     def read(self, t: Any) -> Time:
-        """A time as a plain number.
+        """Checks a time and returns it as a plain number.
 
         Raises:
             InputError: it is not a finite number, or a float too large to be exact.
@@ -67,7 +67,7 @@ class Clock:
         )
 
     def seconds(self, t: Time) -> float:
-        """Since the origin; 0 while there is none.
+        """Seconds since the origin; 0 if there is none.
 
         Raises:
             InputError: too far away to be given in seconds.
@@ -93,14 +93,14 @@ class Clock:
             return math.inf if later > earlier else -math.inf
 
     def rebase(self, t: Time, seconds: float) -> None:
-        """Moves the origin, so that `t` is so many seconds after it."""
+        """Moves the origin so that `t` is `seconds` after it."""
         ticks = seconds * self.ticks
         exact = isinstance(t, int) and self.ticks > 1
         self.origin = t - (round(ticks) if exact else ticks)
 
 
 class RowReader:
-    """Turns values in original units into one scaled row and its mask.
+    """Converts values in original units to one scaled row and its mask.
 
     Args:
         names: of the channels, in the order of the model.

@@ -1,4 +1,4 @@
-"""What a stream does with messages out of order, and how often it did."""
+"""Options of a stream for messages out of order, and counters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ until it is clear whether the clock has jumped. `jumped`: the clock has.
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """What to do with messages that are not simply the next row.
+    """Options for messages out of order, repeated, stale or on another clock.
 
     With the defaults a stream of increasing times is the batch pass over the same rows, whatever
     its gaps, and no single wrong time stamp can end it.
@@ -37,9 +37,9 @@ class StreamOptions:
         reorder_rows: rows that are kept for `reorder`; what is older than these is dropped.
         stale_after_s: s; what is older than this on arrival is dropped, whatever `late` says:
             behind the `now` that `observe` is given, or else behind the newest row. None: never.
-        jump: when the clock has jumped, `reset`, start again at the new time; `continue`, keep the
-            state and take the jump for one median gap; `drop`, only the old clock counts, and what
-            is far behind it is late; or `error`.
+        jump: when the clock has jumped, `reset`, reset the state at the new time; `continue`, keep
+            the state and treat the jump as one median gap; `drop`, keep the old clock, so that
+            messages far behind it are late; or `error`.
         jump_back_s: s; a message older than the newest row by more than this may mean a clock that
             was set back (a simulation started again, a log played again).
         jump_ahead_s: s; a message newer than the newest row by more than this may mean a clock that
@@ -48,7 +48,7 @@ class StreamOptions:
             pending, and one message on the old clock makes them late ones. Nothing pending is
             lost: after the jump they are consumed.
         long_gap: after more than `long_gap_s` without a value, `saturate`, let the model's own
-            limit act, or `reset`, start again.
+            limit act, or `reset`, reset the state.
         long_gap_s: s; None is the model's own limit, where time saturates.
         window_rows: newest rows that a model without a recurrent state is run on; None: as many as
             the longest trajectory that it was trained on.
@@ -105,7 +105,7 @@ class StreamOptions:
 
 @dataclass
 class StreamCounters:
-    """How many of each a stream has met. A reset leaves them.
+    """Counters of a stream. A reset does not change them.
 
     Attributes:
         messages: given to `observe`, errors left out.
@@ -123,7 +123,7 @@ class StreamCounters:
         jumps_ahead: times the clock was set ahead.
         long_gaps: gaps longer than the limit.
         longest_gap_s: s, the longest time without a value.
-        resets: times the state started again, for whatever reason.
+        resets: times the state was reset, for any reason.
         predictions: times predicted at.
     """
 
@@ -167,7 +167,7 @@ def with_options(options: StreamOptions | None, changes: dict[str, Any]) -> Stre
     """Options with some fields replaced.
 
     Args:
-        options: None stands for the defaults.
+        options: None for the defaults.
         changes: fields of `StreamOptions`.
 
     Raises:

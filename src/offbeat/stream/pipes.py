@@ -1,4 +1,4 @@
-"""Lines in, lines out, until the input ends or a signal comes; nothing that was read is lost."""
+"""Reads and answers lines until the input ends or a signal arrives; no line read is lost."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _one(answer: Callable[[bytes], bytes], refuse: Callable[[str], bytes], line:
 
 
 def _chunks(source: int, stop: int) -> Iterator[bytes]:
-    """What arrives; once `stop` is readable, only what has arrived already."""
+    """Yields input as it arrives; once `stop` is readable, only what has arrived already."""
     budget = _MOST_AFTER_STOP
     while budget > 0:
         ready, _, _ = select.select([source, stop], [], [])
@@ -107,7 +107,7 @@ def _stop_signals() -> Iterator[int]:
 
 
 def _write(sink: int, data: bytes) -> None:
-    """All of it, however little is written at a time."""
+    """Writes all bytes, in as many calls as needed."""
     while data:
         try:
             data = data[os.write(sink, data) :]

@@ -1,4 +1,4 @@
-"""Where a message belongs: after the rows, among them, or nowhere; and clocks that jump."""
+"""Places messages after or among the rows, drops them, and detects jumps of the clock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from offbeat.stream.options import Outcome, StreamCounters, StreamOptions
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Message:
-    """A pending message, its time as it came, its values as a row."""
+    """A pending message: its original time, and its values as a row."""
 
     t: Time
     values: NDArray[Any]
@@ -27,7 +27,7 @@ class Message:
 
 
 class Placement:
-    """Makes rows in the order of time of messages in any order, and counts what it does.
+    """Orders messages into rows by time, and counts what was done with them.
 
     Args:
         engine: consumes the rows.
@@ -72,11 +72,11 @@ class Placement:
 
     @property
     def time(self) -> Time | None:
-        """Of the newest row, in the unit of the clock; None before the first."""
+        """Time of the newest row, in the unit of the clock; None before the first."""
         return self.clock.at(self.history.newest) if self.history.rows else None
 
-    def begin_anew(self) -> None:
-        """Nothing observed yet; the counters go on."""
+    def reset(self) -> None:
+        """Resets the state. The counters keep their values."""
         self._engine.reset()
         self.history.forget()
         self.clock.origin = None
@@ -89,7 +89,7 @@ class Placement:
         return outcome
 
     def record(self) -> dict[str, Any]:
-        """All of it, JSON-like."""
+        """The state as a JSON-like record."""
         return {
             "origin": self.clock.origin,
             "seen": self.seen,
@@ -104,7 +104,7 @@ class Placement:
         """The inverse of `record`.
 
         Raises:
-            InputError: the record is damaged. Nothing has changed then.
+            InputError: the record is damaged. Nothing changes then.
         """
         channels = len(self._names)
         values, mask = np.zeros(channels, self._engine.dtype), np.zeros(channels, dtype=bool)
@@ -130,7 +130,7 @@ class Placement:
     def take(
         self, t: Time, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
     ) -> Outcome:
-        """Puts a message where it belongs."""
+        """Places a message."""
         options = self._options
         if not self.history.rows:
             self.clock.origin = t
@@ -150,12 +150,12 @@ class Placement:
     def _append(
         self, time: float, values: NDArray[Any], mask: NDArray[np.bool_], measured: int
     ) -> Outcome:
-        """The next row."""
+        """Appends the next row."""
         gap = time - self.seen if measured and self.seen is not None else 0.0
         long = gap > self._long_gap
         if long and self._options.long_gap == "reset":
             origin, floor = self.clock.origin, self.history.newest
-            self.begin_anew()
+            self.reset()
             self.clock.origin, self.history.floor = origin, floor
         if self.before_row is not None:
             self.before_row(time)
@@ -168,7 +168,7 @@ class Placement:
         return "new"
 
     def _join(self, i: int, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
-        """A message of the time of row i."""
+        """Merges a message into row i, which has the same time."""
         old = self.history.rows[i]
         twice = mask & old.mask
         repeated = bool(twice.any())
@@ -189,7 +189,7 @@ class Placement:
         return "merged" if changed else "duplicate"
 
     def _late(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
-        """A message older than the newest row."""
+        """Handles a message older than the newest row."""
         options, behind = self._options, self.history.newest - time
         if behind > (options.stale_after_s or math.inf):
             return self.drop("stale")
@@ -214,7 +214,7 @@ class Placement:
     # --- clocks that jump -------------------------------------------------------------------------
 
     def _far(self, t: Time, ahead: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> Outcome:
-        """A message so far off that the clock may have jumped."""
+        """Handles a message so far off that the clock may have jumped."""
         options = self._options
         if options.jump == "error":
             newer = "newer" if ahead > 0 else "older"
@@ -237,7 +237,7 @@ class Placement:
         self.counters.jumps_ahead += ahead > 0
         self.counters.jumps_back += ahead < 0
         if options.jump == "reset":
-            self.begin_anew()
+            self.reset()
         else:
             self.clock.rebase(pending[0].t, self.history.newest + self._pause)
         for message in pending:
@@ -245,7 +245,7 @@ class Placement:
         return "jumped"
 
     def _take_pending(self, message: Message) -> None:
-        """Consumes a pending message; what the options call an error is dropped: it is old."""
+        """Consumes a pending message; drops it where the options ask for an error."""
         try:
             measured = int(np.count_nonzero(message.mask))
             self.take(message.t, message.values, message.mask, measured)
@@ -253,7 +253,7 @@ class Placement:
             self.drop("late")
 
     def _release(self) -> None:
-        """The clock has not jumped: pending messages are late, or too far ahead."""
+        """Drops pending messages as late or too far ahead, if the clock has not jumped."""
         pending, self.pending = self.pending, []
         for message in pending:
             time = self.clock.seconds(message.t)

@@ -1,4 +1,4 @@
-"""Runs a model without a recurrent state: for each prediction, again on its newest rows."""
+"""Runs a model without a recurrent state on the newest rows, again for each prediction."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class ReplayEngine(Engine):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the model's parameters."""
+        """Dtype of the model's parameters."""
         return np.dtype(str(self._model.dtype).removeprefix("torch."))
 
     def reserve(self, slots: int) -> None:
-        """Makes room for references: arrays are never changed, only followed by others."""
+        """Allocates slots for references; arrays are never modified in place."""
         self._slots = [{}] * slots
 
     def reset(self) -> None:
-        """No rows."""
+        """Drops all rows."""
         shape = (0, self._model.channels)
         self._rows: Arrays = {
             "time": np.zeros(0),
@@ -57,7 +57,7 @@ class ReplayEngine(Engine):
         }  # fmt: skip
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Each time as one more row, in which nothing is observed, of a trajectory of its own."""
+        """Predicts each time as an unobserved last row of a trajectory of its own."""
         seen, channels = self._rows["mask"], self._model.channels
         known = np.where(seen, self._rows["values"].astype(np.float64), np.nan)
         values = np.concatenate([known, np.full((1, channels), np.nan)])
@@ -77,11 +77,11 @@ class ReplayEngine(Engine):
         self._slots[slot] = self._rows
 
     def load(self, slot: int) -> None:
-        """Goes back to rows that were kept."""
+        """Restores saved rows."""
         self._rows = self._slots[slot]
 
     def export(self) -> Arrays:
-        """The rows, after as many empty ones as are missing of a window; and their number."""
+        """The rows, padded at the start to a full window, and their number."""
         rows = len(self._rows["time"])
         padded = {
             name: np.concatenate(
@@ -92,12 +92,12 @@ class ReplayEngine(Engine):
         return {**padded, "rows": np.array(rows)}
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes what `export` gave."""
+        """Restores a state from `export`."""
         rows = min(max(int(arrays["rows"]), 0), self._window)
         self._rows = {name: arrays[name][self._window - rows :] for name in self._rows}
 
     def fingerprint(self) -> str:
-        """Of the class and the tensors."""
+        """Fingerprint of the class and the tensors."""
         record = [self._model.name, str(self._model.dtype), self._window]
         digest = hashlib.sha256(json.dumps(record).encode())
         for name, tensor in sorted(self._model.state_dict().items()):

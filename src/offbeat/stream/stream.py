@@ -1,4 +1,4 @@
-"""`Stream`: a trained model that runs on messages as they arrive."""
+"""`Stream`: runs a trained model on messages as they arrive."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from offbeat.stream.torch_engine import TorchEngine
 
 
 class Stream(LiveStream):
-    """A trained model that takes messages as they arrive, and predicts at any time.
+    """Runs a trained model on messages as they arrive, and predicts at any time.
 
     A stream of increasing times is the batch pass over the same rows, input transforms included:
     an angle that is sent wrapped is predicted wrapped. `StreamOptions` says what is done with
-    messages that are late, repeated, stale or on another clock; all of it is counted.
+    messages that are late, repeated, stale or on another clock; counters record it.
 
-    Models that `predict` refuses to ask for times can be asked here: the prediction is that of a
-    row at that time, should it be the next one, and no row is added. A model with
+    Models for which `predict` does not support `times` work here: the prediction is that of a
+    row at that time, if it is the next one, and no row is added. A model with
     `readout="last_row"` predicts the same for every time. A model without a recurrent state is run
     again on its newest `window_rows` rows for each prediction.
 
     Args:
-        model: trained; its weights must stay as they are.
+        model: trained; its weights must not change.
         options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns. Integers are exact.
         seed: of the generator of self-feeding.
@@ -68,7 +68,7 @@ class Stream(LiveStream):
 
 
 def engine_of(model: BaseModel, *, seed: int, window: int) -> Engine:
-    """The fastest engine that runs a model.
+    """Returns the fastest engine that supports a model.
 
     Args:
         model: any.

@@ -1,4 +1,4 @@
-"""Runs a recurrent model row by row by its own forward pass, as batches of one row."""
+"""Runs a recurrent model row by row with its forward pass, as batches of one row."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from offbeat.stream.engine import Arrays, Engine
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A recurrent state, and the state of its generator, which is shared and moves on."""
+    """A recurrent state, and the state of its generator at that time."""
 
     past: RecurrentState
     generator: Tensor | None
 
 
 class TorchEngine(Engine):
-    """The reference: `model(row, past=...)`.
+    """The reference engine: calls `model(row, past=...)`.
 
     Args:
         model: its weights are used as they are when a row comes.
@@ -42,15 +42,15 @@ class TorchEngine(Engine):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of the model's weights."""
+        """Dtype of the model's weights."""
         return np.dtype(str(self._model.dtype).removeprefix("torch."))
 
     def reserve(self, slots: int) -> None:
-        """Makes room for references: states are never changed, only followed by others."""
+        """Allocates slots for references; states are never modified in place."""
         self._slots = [None] * slots
 
     def reset(self) -> None:
-        """Starts again, with the first random number."""
+        """Resets the state and the generator."""
         feeding = bool(self._model.config.self_feeding)
         generator = torch.Generator().manual_seed(self._seed) if feeding else None
         with torch.inference_mode():
@@ -79,7 +79,7 @@ class TorchEngine(Engine):
             raise
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Each time as a trajectory of its own, all with the current state."""
+        """Predicts each time as a trajectory of its own, all from the current state."""
         count, channels = len(times), self._model.channels
         unseen = torch.zeros((count, 1, channels), dtype=torch.bool)
         asked = Batch(
@@ -110,7 +110,7 @@ class TorchEngine(Engine):
         self._slots[slot] = self._state()
 
     def load(self, slot: int) -> None:
-        """Goes back to a state that was kept."""
+        """Restores a saved state."""
         kept = self._slots[slot]
         if kept is None:
             raise ValueError(f"nothing was saved in slot {slot}")
@@ -126,7 +126,7 @@ class TorchEngine(Engine):
         return arrays
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes the parts of a recurrent state."""
+        """Restores the parts of a recurrent state."""
         device = self._model.device
         parts: dict[str, Any] = {
             name: torch.tensor(arrays[name], device=device) for name in _tensors(self._past)
@@ -136,7 +136,7 @@ class TorchEngine(Engine):
         self._take(_State(past, generator))
 
     def fingerprint(self) -> str:
-        """Of config, statistics, scaler, channels and weights."""
+        """Fingerprint of config, statistics, scaler, channels and weights."""
         model = self._model
         record = {
             "model": asdict(model.config),

@@ -29,11 +29,11 @@ _PREFIX = "transforms."
 
 @dataclass(frozen=True, eq=False)
 class TransformState:
-    """What a stream must remember to transform its next row.
+    """State of the transforms between rows.
 
     Attributes:
         angle: (angles,) the last observation of each angle as it was sent; NaN before the first.
-        turns: (angles,) turns taken out of it.
+        turns: (angles,) number of turns removed from it.
         in_range: (angles,) whether all observations so far lay in the range of the sensor.
         quaternion: (quaternions, 4) the last observation, of length 1; NaN before the first.
         sign: (quaternions,) 1 or -1, applied to it.
@@ -47,10 +47,10 @@ class TransformState:
 
 
 class LiveTransforms:
-    """`Transforms` for one row after the other; the state is given and returned.
+    """Applies `Transforms` row by row; takes and returns the state.
 
     Args:
-        transforms: of the model.
+        transforms: input transforms of the model.
         names: channels of a row, in order.
     """
 
@@ -65,7 +65,7 @@ class LiveTransforms:
         self._fours = [[names.index(name) for name in four] for four in fours]
 
     def start(self) -> TransformState:
-        """Nothing observed yet."""
+        """Returns the state before the first observation."""
         angles, quaternions = len(self._angles), len(self._fours)
         return TransformState(
             np.full(angles, np.nan),
@@ -120,7 +120,7 @@ class LiveTransforms:
         )
 
     def undo(self, predicted: Values, state: TransformState) -> Values:
-        """Takes predictions back to the convention of what was sent.
+        """Converts predictions back to the convention of the sent values.
 
         Args:
             predicted: (times, channels) in original units.
@@ -137,11 +137,11 @@ class LiveTransforms:
 
 
 class TransformedEngine(Engine):
-    """Takes rows as they were sent, in original units, and predicts in the same convention.
+    """Takes rows as sent, in original units, and predicts in the same convention.
 
     Args:
         engine: takes scaled rows.
-        transforms: of the model.
+        transforms: input transforms of the model.
         names: of the channels, in the order of the model.
         scaler: maps original units to those of the engine.
     """
@@ -156,16 +156,16 @@ class TransformedEngine(Engine):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of values in original units."""
+        """Dtype of values in original units."""
         return np.dtype(np.float64)
 
     def reserve(self, slots: int) -> None:
-        """Makes room for copies of the state."""
+        """Allocates slots for copies of the state."""
         self._engine.reserve(slots)
         self._slots = [self._state] * slots
 
     def reset(self) -> None:
-        """Starts again: no turns, no signs."""
+        """Resets the state and the transforms."""
         self._engine.reset()
         self._state = self._live.start()
 
@@ -197,12 +197,12 @@ class TransformedEngine(Engine):
         return {**self._engine.export(), **own}
 
     def restore(self, arrays: Arrays) -> None:
-        """Takes what `export` gave."""
+        """Restores a state from `export`."""
         self._engine.restore({k: v for k, v in arrays.items() if not k.startswith(_PREFIX)})
         own = {k.removeprefix(_PREFIX): v for k, v in arrays.items() if k.startswith(_PREFIX)}
         self._state = TransformState(**own)
 
     def fingerprint(self) -> str:
-        """Of the engine and the transforms."""
+        """Fingerprint of the engine and the transforms."""
         record = json.dumps(self._transforms.to_dict(), sort_keys=True)
         return hashlib.sha256((self._engine.fingerprint() + record).encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""A fingerprint of the numbers that this process makes: the bits of small trainings.
+"""A fingerprint of the numerics of this process: a hash of the bits of small trainings.
 
-A training that goes on for thousands of steps amplifies a difference in the last digit, so runs are
-alike only if each bit of each step is. Whether they are is measured, not guessed from the source: a
+Thousands of training steps amplify a difference in the last digit, so runs are comparable
+bit for bit only if each step is. This is measured, not derived from the source code: a
 faster kernel that adds in the same order keeps the fingerprint, another default changes it.
 """
 
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from offbeat.metrics import Scores
 
 _MODELS = ("gru_d", "ode_rnn", "anchored_ode_gru_d")
-"""They meet each part that the zoo's models consist of, but for Elman and LSTM cells."""
+"""Together they use each part of the zoo's models except Elman and LSTM cells."""
 
 
-def walks(trajectories: int, rows: int, channels: int) -> Dataset:
+def random_walks(trajectories: int, rows: int, channels: int) -> Dataset:
     """Random walks on a grid of 5 ms, the same bits on every machine: sums of small integers."""
     steps = np.random.default_rng(0).integers(-8, 9, (trajectories, rows, channels))
     values = steps.cumsum(axis=1).astype(np.float64) / 64
@@ -63,7 +63,7 @@ def fingerprint() -> str:
     from offbeat.training import fit
 
     train, validation, test = apply_split(
-        walks(64, 40, 3), SplitConfig(window=30, observed_fraction=0.5)
+        random_walks(64, 40, 3), SplitConfig(window=30, observed_fraction=0.5)
     )
     whole = hashlib.sha256()
     for name in _MODELS:

@@ -1,4 +1,4 @@
-"""What a sweep consists of: its runs, and what each of them is made of."""
+"""Interface of a sweep's plan: its runs, and the data and configuration of each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Run(Protocol):
 
     @property
     def run_id(self) -> str:
-        """Name of the run, and of its folder."""
+        """Name of the run and of its folder."""
 
     @property
     def model(self) -> str:
@@ -39,21 +39,21 @@ class Run(Protocol):
 
     @property
     def seed_draw(self) -> int:
-        """Of windows, masks, split and batches: equal for the models of a repeat."""
+        """Seed of windows, masks, split and batches: equal for the models of a repeat."""
 
     @property
     def seed_weights(self) -> int:
-        """Of the initial weights."""
+        """Seed of the initial weights."""
 
 
 class Plan(ABC):
     """The runs of a sweep. A frozen, hashable value that can be sent to another process.
 
     Attributes:
-        file: where a folder keeps the settings that it was begun with.
+        file: where a folder keeps the settings that it was created with.
         noun: what it is called in messages.
         record: class of the record, which names its columns.
-        grows: a folder may be gone on with by a plan that has other runs.
+        grows: whether a folder can be continued by a plan that has other runs.
     """
 
     file: ClassVar[str] = "sweep.json"
@@ -63,14 +63,14 @@ class Plan(ABC):
 
     @abstractmethod
     def runs(self) -> tuple[Run, ...]:
-        """All runs, in the order in which they are begun."""
+        """All runs, in the order in which they are started."""
 
     @abstractmethod
     def settings(self) -> Mapping[str, Any]:
-        """What all runs have in common, JSON-like: a folder is gone on with by the same alone."""
+        """Settings of all runs, JSON-like; a folder is continued only with equal ones."""
 
     def models(self) -> Mapping[str, Any]:
-        """More settings, of single models: a folder may be gone on with by more of these."""
+        """Settings of single models; a folder can be continued with more models."""
         return {}
 
     @abstractmethod
@@ -83,22 +83,22 @@ class Plan(ABC):
 
     @abstractmethod
     def scaler(self, recorded: Dataset, train: Dataset) -> Scaler:
-        """The scaler of a repeat's models, whose units all of its scores have."""
+        """The scaler of a repeat's models, which defines the units of all of its scores."""
 
     @abstractmethod
     def model_config(self, label: str) -> ModelConfig:
-        """What the model of a label consists of."""
+        """Configuration of the model of a label."""
 
     @abstractmethod
     def train_config(self, run: Run) -> TrainConfig:
-        """How a run is trained; its seed is that of the draw."""
+        """Training configuration of a run; its seed is that of the draw."""
 
     @abstractmethod
     def provenance(self) -> dict[str, str]:
-        """What makes runs in this process: columns of the record."""
+        """Code, processor and libraries of this process, as columns of the record."""
 
     def fingerprint(self, recorded: Dataset) -> str:
-        """Of the content of the trajectories."""
+        """Fingerprint of the content of the trajectories."""
         return recorded.fingerprint()
 
     def draw(self, run: Run) -> Hashable:
@@ -106,13 +106,13 @@ class Plan(ABC):
         return run.seed_draw
 
     def steps(self, run: Run) -> int | None:
-        """Optimizer steps of a run; None where they are not known before."""
+        """Optimizer steps of a run; None if not known in advance."""
         return None
 
     def columns(
         self, run: Run, model: BaseModel, test: Dataset, recorded: Dataset
     ) -> dict[str, Any]:
-        """More columns of a run's row.
+        """Additional columns of a run's row.
 
         Args:
             run: which run.

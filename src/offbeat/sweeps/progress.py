@@ -1,4 +1,4 @@
-"""How far a sweep has come: a line for a person, a file for everything else."""
+"""Progress of a sweep: a line on the terminal and a status file."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def seconds_left(
     *,
     capacity: int,
 ) -> float | None:
-    """Wall time that is left, from what an epoch of each model has cost so far.
+    """Estimates the remaining wall time from the cost of an epoch of each model so far.
 
     Args:
-        waiting: runs that have not begun.
-        running: runs under way, each with its finished epochs.
+        waiting: runs that have not started.
+        running: runs in progress, each with its finished epochs.
         finished: rows of the record that were made here.
         capacity: runs at a time.
 
@@ -66,10 +66,10 @@ def duration(seconds: float | None) -> str:
 
 
 class Progress:
-    """Shows and writes down how far it is.
+    """Shows the progress and writes it to a file.
 
     Args:
-        path: of the status file, JSON.
+        path: of the status file (JSON).
         show: print to standard error: a line that updates on a terminal, else a line per run.
     """
 
@@ -80,13 +80,13 @@ class Progress:
         self._width = 0
 
     def say(self, text: str) -> None:
-        """Prints a line of its own."""
+        """Prints a separate line."""
         if self.show:
             self._clear()
             print(text, file=sys.stderr, flush=True)
 
     def due(self) -> bool:
-        """Whether the last update is some seconds old."""
+        """Whether the next update is due."""
         return time.monotonic() - self._last >= _EVERY_S
 
     def update(
@@ -98,14 +98,14 @@ class Progress:
         running: Mapping[Run, int],
         more: Mapping[str, Any],
     ) -> None:
-        """Shows the state of things, and writes it down.
+        """Shows the progress and writes it to the status file.
 
         Args:
             done: runs finished.
             total: runs in all.
             left: s, or None where it is not known yet.
-            running: runs under way with their finished epochs.
-            more: more for the status file.
+            running: runs in progress with their finished epochs.
+            more: additional entries of the status file.
         """
         self._last = time.monotonic()
         write_json(

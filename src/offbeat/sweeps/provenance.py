@@ -1,7 +1,7 @@
-"""Where numbers come from: the commit, the processor and the libraries of this process.
+"""Provenance of results: commit, processor and libraries of this process.
 
-Sums in another order end in other last digits, and training lets them grow. So runs that were made
-by code that adds in another order, on another processor or by another scan backend are marked.
+Sums in another order differ in the last digits, and training amplifies that. So runs made
+by code that adds in another order, on another processor or by another backend are marked.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ PACKAGE = Path(__file__).parents[1]
 
 
 def provenance(bits: str) -> dict[str, str]:
-    """What makes runs in this process, as columns of a record.
+    """Returns the provenance of this process as columns of a record.
 
     Args:
-        bits: fingerprint of small trainings; equal where the code ends in the same numbers.
+        bits: fingerprint of small trainings; equal if the code gives the same numbers.
 
     Returns:
         `commit` (`git describe` of the checkout, `-dirty` with changes outside `results/`; else the
@@ -49,13 +49,13 @@ def commit() -> str:
         return done.stdout.strip() if done.returncode == 0 else ""
 
     top = git("rev-parse", "--show-toplevel")
-    # Installed into a folder of another project's checkout, that one's commit would say nothing.
+    # Installed inside another project's checkout: that project's commit does not apply.
     if not top or Path(top).resolve() / "src" / "offbeat" != PACKAGE.resolve():
         return f"offbeat {__version__}"
     described = git("describe", "--always", "--abbrev=12")
     if not described:
         return f"offbeat {__version__}"
-    # Runs publish under results/, which would mark the next ones as made by changed code.
+    # Runs write to results/, which must not mark later runs as made by changed code.
     changed = git(
         "-C", top, "status", "--porcelain", "--untracked-files=no", "--", ".", ":(exclude)results"
     )

@@ -82,31 +82,31 @@ class Record:
     """Columns of the table of curves, each with its name in the `log.csv` of a training."""
 
     GROUP: ClassVar[tuple[str, ...]] = ("bits", "cpu", "device", "scan_backend", "torch", "data")
-    """Runs that agree in these were made alike; others are never mixed without a message."""
+    """Runs that agree in these are comparable; others are never mixed without a message."""
 
     runs: Mapping[str, Row]
     curves: Mapping[str, tuple[Row, ...]]
 
     @classmethod
     def empty(cls) -> Self:
-        """No run yet."""
+        """Returns a record without runs."""
         return cls({}, {})
 
     @classmethod
     def read(cls, folder: str | Path) -> Self:
-        """Reads the record that a folder holds; an empty one if it holds none.
+        """Reads the record in a folder; returns an empty one if there is none.
 
         Args:
             folder: with `record.parquet` and `curves.parquet`, or the same as `.csv`.
 
         Raises:
-            FileFormatError: a file is damaged or has other columns, or a run stands twice.
+            FileFormatError: a file is damaged or has other columns, or a run occurs twice.
         """
         folder = Path(folder)
         runs: dict[str, Row] = {}
         for row in _read_table(folder / "record", cls.RUN_COLUMNS):
             if row["run_id"] in runs:
-                raise FileFormatError(f"{folder}: run {row['run_id']!r} stands twice in the record")
+                raise FileFormatError(f"{folder}: run {row['run_id']!r} occurs twice in the record")
             runs[row["run_id"]] = row
         curves: dict[str, list[Row]] = {}
         for row in _read_table(folder / "curves", cls.CURVE_COLUMNS):
@@ -116,7 +116,7 @@ class Record:
 
     @classmethod
     def curve(cls, run_id: str, log: Path) -> tuple[Row, ...]:
-        """The curve of a run as far as its `log.csv` has come; empty if there is no such file."""
+        """The curve of a run so far, from its `log.csv`; empty if there is no such file."""
         if not log.is_file():
             return ()
         columns = {there: cls.CURVE_COLUMNS[name] for name, there in cls.LOG_COLUMNS.items()}
@@ -126,9 +126,9 @@ class Record:
         )
 
     def write(self, folder: str | Path) -> None:
-        """Writes both tables as Parquet and CSV, each whole or not at all.
+        """Writes both tables as Parquet and CSV, each atomically.
 
-        The curves come first, so that a run in the record has its curve.
+        The curves are written first, so that each run in the record has its curve.
         """
         folder = Path(folder)
         lines = [row for rows in self.curves.values() for row in rows]
@@ -162,7 +162,7 @@ class Record:
         )
 
     def groups(self) -> Counter[Group]:
-        """How many runs were made alike, by the values of `GROUP`."""
+        """Number of runs by the values of `GROUP`."""
         return Counter(self.group_of(row) for row in self.runs.values())
 
     @classmethod
@@ -172,7 +172,7 @@ class Record:
 
     @classmethod
     def group_text(cls, group: Group, beside: Group | None = None) -> str:
-        """A group in words; with another one beside it, only what differs from that."""
+        """A group as text; given another group, only the values that differ from it."""
         pairs = zip(cls.GROUP, group, beside or ("",) * len(cls.GROUP), strict=True)
         return ", ".join(f"{name} {value}" for name, value, other in pairs if value != other)
 

@@ -1,4 +1,4 @@
-"""All runs of a plan, whatever stops them in between."""
+"""Runs all runs of a plan; an interrupted call can be repeated to resume."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MIXED = ("refuse", "accept", "redo")
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a call of `sweep` left behind.
+    """Result of a call of `sweep`.
 
     Attributes:
         folder: holds `record.parquet`, `record.csv`, `curves.parquet`, `curves.csv`, `runs/`.
@@ -56,7 +56,7 @@ class SweepResult:
             f"{self.folder}: {done} of {len(self.asked)} runs are in the record, which took "
             f"{duration(spent)} of processes in all; this call: {duration(self.seconds)}"
         )
-        return text if not self.missing else f"{text}. The same call goes on"
+        return text if not self.missing else f"{text}. The same call resumes"
 
     def compare(self, **options: Any) -> Comparison:
         """Compares the models over the repeats.
@@ -88,32 +88,32 @@ def run_plan(
     engine_options: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> SweepResult:
-    """Does the runs of a plan that are not done yet, and keeps a record of them.
+    """Performs the runs of a plan that are not finished, and keeps a record of them.
 
-    Killed at any moment, the same call goes on where it was and ends with the same numbers.
+    It can be killed at any moment: the same call resumes and gives the same numbers.
 
     Args:
-        plan: what to do.
+        plan: the runs and their settings.
         out: folder for data, runs and the record.
         dataset: the trajectories; by default those that the plan simulates.
         engine: `local`, `ray` or `slurm`; all give the same numbers. The workers of a cluster
             must see `out` under the same path.
         asked: runs to do; by default all of them.
-        record: folder of another record, a committed one say; runs in it are not done again.
+        record: folder of another record; runs in it are not repeated.
         mixed: what to do where the record holds runs made by other code, on another processor,
-            with another scan backend, torch or data: `refuse` to go on, `accept` them as they are
-            marked, or `redo` them.
+            with another scan backend, torch or data: `refuse` to continue, `accept` them,
+        marked as they are, or `redo` them.
         processes: runs at a time; by default as many as there is room for.
         threads: of each run.
         device: that models are trained on: `cpu`, `cuda` or `cuda:1`.
-        budget_minutes: stop after so long, in the middle of runs; they go on next time.
+        budget_minutes: stop after this time, in the middle of runs; the next call resumes them.
         engine_options: of Ray or Slurm.
         progress: show how far it is on standard error.
 
     Raises:
         InputError: an argument is wrong, `out` belongs to another plan or is in use, or runs
             would be mixed.
-        DivergenceError: a training left the finite numbers; all other runs were done.
+        DivergenceError: a training diverged; all other runs are finished.
         OffbeatError: a run failed otherwise, or lost its process three times.
     """
     started = time.monotonic()
@@ -160,7 +160,7 @@ def run_plan(
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """Holds the folder for this process."""
+    """Locks the folder for this process."""
     with (out / ".lock").open("w") as file:
         if os.name == "posix":
             import fcntl
@@ -169,14 +169,14 @@ def _alone(out: Path) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise InputError(
-                    f"another process works in {out} (see {out / 'status.json'}); let it end, or "
-                    "give another folder"
+                    f"another process uses {out} (see {out / 'status.json'}); wait until it ends, "
+                    "or give another folder"
                 ) from None
         yield
 
 
 def _same_plan(out: Path, plan: Plan) -> None:
-    """Writes the settings down, or compares them with those that the folder was begun with."""
+    """Saves the settings, or compares them with those that the folder was created with."""
     path = out / plan.file
     now = json.loads(json.dumps({**plan.settings(), **plan.models()}))
     try:
@@ -208,7 +208,7 @@ def _data(out: Path, plan: Plan, dataset: Dataset | None, progress: bool) -> tup
         try:
             kept = str(json.loads(about.read_text(encoding="utf-8"))["fingerprint"])
         except (OSError, ValueError, KeyError, TypeError):
-            path.unlink()  # begun and not finished
+            path.unlink()  # an unfinished file
         else:
             if given not in (None, kept):
                 raise InputError(
@@ -225,7 +225,7 @@ def _data(out: Path, plan: Plan, dataset: Dataset | None, progress: bool) -> tup
 
 
 def _known(out: Path, record: str | Path | None, tasks: Mapping[str, Task], plan: Plan) -> Record:
-    """All that is done: the folder's record, finished runs that it lacks, and the other record."""
+    """All finished runs: the folder's record, finished runs that it lacks, the other record."""
     kept = plan.record.read(out)
     for name, task in tasks.items():
         row = None if name in kept.runs else task.result()
@@ -262,7 +262,7 @@ def _check_row(name: str, row: Row, tasks: Mapping[str, Task], plan: Plan) -> No
 def _unmixed(
     kept: Record, mixed: str, tasks: Mapping[str, Task], here: Group, shown: Progress
 ) -> Record:
-    """Looks at who made what; says so aloud where it was not made as it would be made here."""
+    """Checks the provenance of the runs; warns where it differs from that of this process."""
     others = {group: count for group, count in kept.groups().items() if group != here}
     if not others:
         return kept
@@ -273,15 +273,15 @@ def _unmixed(
     made = f"{'; '.join(lines)} (here: {kept.group_text(here)})"
     if mixed == "refuse":
         raise InputError(
-            f"the record holds runs that were made otherwise than they would be here: {made}; give "
-            "mixed=accept to keep them, marked as they are, mixed=redo to do them again, or "
+            f"the record has runs of another provenance than this process: {made}; give "
+            "mixed=accept to keep them, marked as they are, mixed=redo to repeat them, or "
             "another folder"
         )
     gone = [name for name, row in kept.runs.items() if kept.group_of(row) in others]
     if mixed == "accept":
         shown.say(f"warning: the record is mixed, {made}; its columns mark them")
         return kept
-    shown.say(f"warning: these are done again: {made}")
+    shown.say(f"warning: these are repeated: {made}")
     for name in gone:
         (tasks[name].folder / SCORES).unlink(missing_ok=True)
     return kept.without(gone)

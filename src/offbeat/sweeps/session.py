@@ -1,4 +1,4 @@
-"""A session of a sweep: tasks go to an engine, finished runs into the record."""
+"""A session of a sweep: sends tasks to an engine and adds finished runs to the record."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _ATTEMPTS = 3
 
 
 class Session:
-    """One session: gives tasks to an engine and writes the record run by run.
+    """One session: sends tasks to an engine and writes the record after each run.
 
     Args:
         out: folder of the record.
         engine: runs the tasks.
-        shown: says how far it is.
-        record: what is done already.
+        shown: reports the progress.
+        record: the runs that are finished.
         order: names of all runs, in the order of the record.
         here: group of the runs that this process would make.
     """
@@ -57,15 +57,15 @@ class Session:
     def run(
         self, tasks: Iterable[Task], *, asked: Iterable[Run], deadline: float | None = None
     ) -> Record:
-        """Does the tasks; returns the record with all of them that succeeded.
+        """Performs the tasks; returns the record with all that succeeded.
 
         Args:
-            tasks: in the order in which to begin them.
+            tasks: in the order in which to start them.
             asked: runs that the user asked for, finished ones too.
             deadline: on the monotonic clock, s; stop then, in the middle of runs.
 
         Raises:
-            DivergenceError: a training left the finite numbers; all others were done.
+            DivergenceError: a training diverged; all others are finished.
             OffbeatError: a run failed otherwise, or lost its process three times.
         """
         self.waiting.extend(tasks)
@@ -87,13 +87,13 @@ class Session:
                         self.shown.say(ending.failure.message)
                     else:
                         raise OffbeatError(
-                            f"{ending.failure.message}; what is done is kept, the same command "
-                            "goes on once this is repaired"
+                            f"{ending.failure.message}; finished runs are kept, the same command "
+                            "resumes once this is fixed"
                         )
                 self._show()
             if self.running:
                 names = ", ".join(self.running)
-                self.shown.say(f"the time is over; these go on next time: {names}")
+                self.shown.say(f"the time is over; the next call resumes: {names}")
         finally:
             self.engine.stop()
             self.running.clear()
@@ -118,17 +118,17 @@ class Session:
         self.attempts[name] = self.attempts.get(name, 0) + 1
         if self.attempts[name] >= _ATTEMPTS:
             raise OffbeatError(
-                f"the process that did {name} was ended {_ATTEMPTS} times, for want of memory "
-                "perhaps; what is done is kept: run the same command with fewer processes"
+                f"the process of {name} was killed {_ATTEMPTS} times, perhaps for lack of memory; "
+                "finished runs are kept: run the same command with fewer processes"
             )
-        self.shown.say(f"the process that did {name} was ended; it goes on in another one")
+        self.shown.say(f"the process of {name} was killed; another one resumes it")
         self.waiting.appendleft(task)
 
     def _finished(self, task: Task) -> None:
         row = task.result()
         if row is None:
             raise OffbeatError(
-                f"{task.folder} has no result although the run has ended; the workers must see "
+                f"{task.folder} has no result although the run ended; the workers must see "
                 "the same folder as this process"
             )
         self.record = self.record.with_run(row, task.curve()).in_order(self.order)
@@ -173,9 +173,9 @@ class Session:
 
 
 class _SessionFile:
-    """What a call did, and how long it lasted: the last line of `sessions.json`.
+    """The runs and the duration of a call: the last entry of `sessions.json`.
 
-    It is written again and again, so that a call that is killed is counted up to its end.
+    It is updated all the time, so that a killed call is counted up to its end.
     """
 
     def __init__(self, folder: Path, engine: str) -> None:
@@ -198,7 +198,7 @@ class _SessionFile:
 
 
 def read_sessions(folder: Path) -> list[dict[str, Any]]:
-    """When the calls that made a record began, how long they lasted, what they did."""
+    """Reads when the calls that made a record began, their durations and their runs."""
     for name in SESSIONS:
         try:
             return list(json.loads((folder / f"{name}.json").read_text(encoding="utf-8")))

@@ -43,14 +43,14 @@ class Job:
     folder: Path
 
     def perform(self, *, progress: bool = False) -> None:
-        """Trains, or goes on training; the same in any process."""
+        """Trains, or resumes training; the same in any process."""
         train, validation = load(self.train), load(self.validation)
         model = make_model(self.name, train, scaler=self.scaler, seed=self.training.seed)
         with one_thread():
             fit(model, train, validation, self.training, out=self.folder, progress=progress)
 
     def history(self) -> tuple[EpochRecord, ...]:
-        """What its log holds so far."""
+        """The epochs in its log so far."""
         log = self.folder / "log.csv"
         if not log.exists():
             return ()
@@ -75,7 +75,7 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
         progress: show a progress bar.
 
     Raises:
-        OffbeatError: what a run raised, or that its process was ended.
+        OffbeatError: a run raised it, or its process was killed.
     """
     if workers == 1:
         for job in jobs:
@@ -106,18 +106,18 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
 
 
 def raise_failure(ending: base.Ending) -> None:
-    """Raises what a job ended with, if it did not succeed."""
+    """Raises the error of a job that failed."""
     if ending.failure is not None:
         raise ending.failure.error(ending.failure.message)
     if ending.lost:
         raise OffbeatError(
-            f"the process that trained {ending.job.name!r} was ended; run the same again, it goes "
-            "on where it was (with workers=1 it needs less memory)"
+            f"the process that trained {ending.job.name!r} was killed; run the same again to "
+            "resume (workers=1 needs less memory)"
         )
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Sums in one order, on any machine; and small steps are faster so."""
+    """Uses one thread: sums in one order on any machine, and small steps are faster."""
     with base.threads_of_torch(1):
         yield

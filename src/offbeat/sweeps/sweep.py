@@ -1,4 +1,4 @@
-"""`sweep`: any models, trained and scored over repeats that share windows, masks and splits."""
+"""`sweep`: trains and scores any models over repeats that share windows, masks and splits."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class SweepRun:
 
     @property
     def run_id(self) -> str:
-        """Name of the run, of its folder too: `ode_rnn-r04`."""
+        """Name of the run and of its folder: `ode_rnn-r04`."""
         return f"{self.model}-r{self.repeat:02d}"
 
 
@@ -52,7 +52,7 @@ class SweepPlan(Plan):
     """Models over repeats on one data set.
 
     Attributes:
-        choices: label, config and training of each model.
+        choices: label, configuration and training of each model.
         repeats: how many; repeat i has the seeds of `split` plus i.
         split: windows, masks and split.
         scaler_kind: fitted on the training part of a repeat.
@@ -66,7 +66,7 @@ class SweepPlan(Plan):
     scaler_kind: str = "standardise"
 
     def runs(self) -> tuple[Run, ...]:
-        """Repeat by repeat, so that a part of a sweep can be compared."""
+        """Ordered by repeat, so that an unfinished sweep can be compared."""
         seeds = [(i, self.split.seed + i) for i in range(self.repeats)]
         return tuple(
             SweepRun(label, i, recipe_of(model.name, training, validated=True).epochs, seed, seed)
@@ -98,22 +98,22 @@ class SweepPlan(Plan):
         return Scaler.fit(self.scaler_kind, train)
 
     def model_config(self, label: str) -> ModelConfig:
-        """As it was given."""
+        """Configuration of the model, as given."""
         return next(model for name, model, _ in self.choices if name == label)
 
     def train_config(self, run: Run) -> TrainConfig:
-        """As it was given, with the seed of the repeat."""
+        """Configuration of the training, as given, with the seed of the repeat."""
         training = next(training for name, _, training in self.choices if name == run.model)
         return replace(training, seed=run.seed_draw)
 
     def provenance(self) -> dict[str, str]:
-        """Of this process, as it stood when it was first asked."""
+        """Provenance of this process at the first call."""
         return _provenance()
 
     def columns(
         self, run: Run, model: BaseModel, test: Dataset, recorded: Dataset
     ) -> dict[str, Any]:
-        """The condition, which is the same for all runs."""
+        """The condition, equal for all runs."""
         split = self.split
         window = split.window if split.window_s is None else f"{split.window_s:g} s"
         said = [] if window is None else [f"window {window}"]
@@ -149,18 +149,18 @@ def sweep(
     """Trains and scores models over repeats on any data, and keeps a record of all runs.
 
     In repeat i, every model is trained on the windows, masks and split that seed `split.seed + i`
-    draws, so that `compare` can pair them. Killed at any moment, the same call goes on where it was
-    and ends with the same numbers. A folder can be gone on with more models and more repeats.
+    draws, so that `compare` can pair them. The call can be killed at any moment: the same call
+    resumes and gives the same numbers. It can be repeated with more models and more repeats.
 
     Args:
         dataset: the trajectories.
-        models: names or configs; a mapping gives them labels of their own. A model of one's own
-            must be known to other processes: by an entry point of the group `offbeat.models`.
+        models: names or configurations; the keys of a mapping are labels. A registered model
+            must be known to other processes, through an entry point of the group `offbeat.models`.
         out: folder: `record.parquet` and `.csv` (a line per run, the last-value predictor's scores
             among them), `curves.*` (a line per epoch), `status.json`, `data/`, `runs/`.
         repeats: how many.
         split: windows, masks and split; its seed is that of the first repeat.
-        training: of all models, or by label; what it leaves open is the recipe of the model. The
+        training: of all models, or by label; fields left at None follow the model's recipe. The
             weights with the best validation error are kept.
         epochs: replaces those of `training`.
         scaler: `standardise`, `min_max`, `divide_by_max` or `identity`, fitted on the training part
@@ -170,19 +170,19 @@ def sweep(
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.
         device: that models are trained on: `cpu`, `cuda` or `cuda:1`.
-        budget_minutes: stop after so long, in the middle of runs; they go on next time.
+        budget_minutes: stop after this time, in the middle of runs; the next call resumes them.
         mixed: what to do with runs in `out` that were made by other code, on another processor,
-            with another backend, torch or data: `refuse` to go on, `accept` or `redo` them.
+            with another backend, torch or data: `refuse` to continue, `accept` or `redo` them.
         engine_options: arguments of `ray.init`, or of submitit's `update_parameters`.
         progress: show how far it is on standard error.
 
     Returns:
-        The record; its `compare` says which models differ.
+        The record; its `compare` tests which models differ.
 
     Raises:
         InputError: an argument is wrong, `out` belongs to another sweep or is in use, or runs would
             be mixed.
-        DivergenceError: a training left the finite numbers; all other runs were done.
+        DivergenceError: a training diverged; all other runs are finished.
         OffbeatError: a run failed otherwise, or lost its process three times.
 
     Example:

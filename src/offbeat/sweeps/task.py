@@ -1,4 +1,4 @@
-"""One run of a sweep, in any process on any machine: the same numbers, and done once."""
+"""One run of a sweep; gives the same numbers in any process and is performed once."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ CONFIG, SCORES, TRAINING = "config.json", "scores.json", "training"
 
 @dataclass(frozen=True)
 class Task:
-    """One run to do: small, and the same in any process.
+    """One run: a small, picklable task that gives the same result in any process.
 
     Attributes:
         run: what to train.
-        plan: how.
+        plan: the plan of the run.
         recorded: file of the recorded trajectories.
         fingerprint: of their content.
         folder: of the run: config.json, training/ (log.csv, checkpoints, model), scores.json.
@@ -58,7 +58,7 @@ class Task:
         return self.run.run_id
 
     def curve(self) -> tuple[Row, ...]:
-        """The curve of the run, as far as it has come."""
+        """The curve of the run so far."""
         return self.plan.record.curve(self.name, self.folder / TRAINING / "log.csv")
 
     def result(self) -> Row | None:
@@ -77,14 +77,14 @@ class Task:
             ) from None
 
     def perform(self) -> None:
-        """Trains a model and scores it, or goes on where a process that was killed left off.
+        """Trains and scores a model, or resumes where a killed process stopped.
 
-        A finished run is left alone, and a run that another process works on is waited for, so none
-        is done twice. A run that was begun by other code, on another processor or with another scan
-        backend is begun again: a run is never made half by one and half by the other.
+        A finished run is kept, and a run of another process is waited for, so no run
+        is performed twice. A run that other code, another processor or another scan
+        backend started is restarted: no run mixes two provenances.
 
         Raises:
-            DivergenceError: the training left the finite numbers.
+            DivergenceError: the training diverged.
             FileFormatError: the recorded trajectories are not those of the task.
             OSError: the disk is full.
         """
@@ -110,13 +110,13 @@ class Task:
             "device": self.device,
             "provenance": here,
         }
-        before = _take_up(self.folder, config)
+        before = _prepare(self.folder, config)
         started, out = time.time(), self.folder / TRAINING
         write_json(self.folder / CONFIG, {**config, "began": started, "seconds_before": before})
         options: dict[str, Any] = {"out": out, "device": self.device, "progress": False}
         try:
             fitted = fit(model, train, validation, training, **options)
-        except FileFormatError:  # a power cut can leave a checkpoint that is not whole
+        except FileFormatError:  # a power failure can leave an incomplete checkpoint
             shutil.rmtree(out)
             before, started = 0.0, time.time()
             model = make_model(chosen, train, scaler=scaler, seed=run.seed_weights)
@@ -145,8 +145,8 @@ class Task:
         write_json(self.folder / SCORES, {"run": kept, "evaluation": evaluation.to_dict()})
 
 
-def _take_up(folder: Path, config: dict[str, Any]) -> float:
-    """Prepares the folder of a run; returns the wall time that went into it before, s."""
+def _prepare(folder: Path, config: dict[str, Any]) -> float:
+    """Prepares the folder of a run; returns the wall time spent on it before, s."""
     try:
         kept = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -161,7 +161,7 @@ def _take_up(folder: Path, config: dict[str, Any]) -> float:
 
 
 def _comparable(kept: Any, keys: Iterable[str]) -> dict[str, Any]:
-    """What must be the same for a run to go on: all but the commit, which is a name."""
+    """Settings that must be equal to resume a run: all except the commit."""
     part: dict[str, Any] = {key: kept.get(key) for key in keys} if isinstance(kept, dict) else {}
     made = part.get("provenance")
     if isinstance(made, dict):
@@ -169,7 +169,7 @@ def _comparable(kept: Any, keys: Iterable[str]) -> dict[str, Any]:
     return part
 
 
-# --- data, kept from run to run -------------------------------------------------------------------
+# --- data, kept between runs ----------------------------------------------------------------------
 
 _LAST: dict[Any, tuple[Parts, Scaler]] = {}
 """The parts of the last repeat, which its models share."""
@@ -198,7 +198,7 @@ def _recorded(path: Path, fingerprint: str, plan: Plan) -> Dataset:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Holds a file for this process, whose id it names; waits for another one that holds it."""
+    """Locks a file for this process and writes its id; waits for a process that locks it."""
     with path.open("a") as file:
         if os.name == "posix":
             import fcntl

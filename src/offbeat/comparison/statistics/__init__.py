@@ -1,6 +1,6 @@
-"""Statistics of runs: they take scores and return records of every number; no torch, no files.
+"""Statistics of scores: functions that take arrays and return records; no torch, no files.
 
-Which test assumes what, and which ones decide, stands in `docs/statistics.md`.
+`docs/statistics.md` lists the assumptions of each test, and which tests decide.
 """
 
 from offbeat.comparison.statistics.bootstrap import bca

@@ -1,8 +1,8 @@
 """Bootstrap intervals: bias-corrected and accelerated (BCa), seeded.
 
 Efron, J. Am. Stat. Assoc. 82 (1987) 171; Efron and Tibshirani, An Introduction to the Bootstrap
-(1993), chapter 14. Written here, and not taken from `scipy.stats.bootstrap`, because a ratio has
-resamples in which it is not defined, and because the seed is to mean the same under any version.
+(1993), chapter 14. `scipy.stats.bootstrap` is not used, because a ratio has
+resamples in which it is not defined, and to give the same draws for a seed in any version.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from offbeat.comparison.statistics.samples import Estimate, Sample, check_level
 from offbeat.errors import InputError
 
 FEWEST_RESAMPLED = 5
-"""Below as many values an interval is None: resamples of so few repeat themselves."""
+"""With fewer values the interval is None, because few of the resamples differ."""
 
-_UNDEFINED_SHARE = 0.01
+_UNDEFINED_FRACTION = 0.01
 
 Statistic = Callable[..., NDArray[np.float64]]
-"""From one array per sample, each (..., runs), to (...,)."""
+"""Maps one array per sample, each (..., runs), to (...,)."""
 
 
 def bca(
@@ -38,10 +38,10 @@ def bca(
     Args:
         statistic: vectorised over leading axes.
         samples: (runs,) each.
-        paired: places belong together and are drawn together.
+        paired: the samples are paired, and pairs are drawn together.
         confidence: of the two-sided interval.
-        resamples: how often the runs are drawn again, with replacement.
-        seed: of the draws.
+        resamples: number of resamples.
+        seed: of the resampling.
 
     Returns:
         The interval is None with fewer than 5 runs, and where the statistic is undefined in more
@@ -71,10 +71,10 @@ def bca(
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = statistic(*drawn)
     spread = spread[np.isfinite(spread)]
-    if len(spread) < (1 - _UNDEFINED_SHARE) * resamples:
+    if len(spread) < (1 - _UNDEFINED_FRACTION) * resamples:
         return nothing
     below = ((spread < value).mean() + (spread <= value).mean()) / 2
-    if not 0 < below < 1:  # the value lies outside its own resamples
+    if not 0 < below < 1:  # the value is outside its resamples
         return nothing
     bias, lean = ndtri(below), _acceleration(statistic, samples, paired)
     tail = ndtri((1 - confidence) / 2)
@@ -84,7 +84,7 @@ def bca(
 
 
 def _acceleration(statistic: Statistic, samples: tuple[Sample, ...], paired: bool) -> float:
-    """A sixth of the skewness of the influence of single runs, by leaving each out in turn."""
+    """A sixth of the skewness of the jackknife influence values."""
     groups = [range(len(samples))] if paired else [[i] for i in range(len(samples))]
     cubes = squares = 0.0
     for group in groups:

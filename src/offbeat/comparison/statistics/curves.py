@@ -1,4 +1,4 @@
-"""How fast training converges, measured on validation curves instead of seen by eye."""
+"""How fast training converges, measured on validation curves."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ _TREND_OVER = 10
 
 @dataclass(frozen=True)
 class Settling:
-    """When one validation curve has come near the value it ends with. Epochs count from 1.
+    """When a validation curve comes near its final value. Epochs count from 1.
 
     Attributes:
         epochs: length of the curve.
         final: value at the end.
-        lowest: least value of the curve.
-        lowest_epoch: where it stands.
+        lowest: lowest value of the curve.
+        lowest_epoch: its epoch.
         reached: first epoch at most `tolerance` above the final value.
-        settled: epoch from which on the curve stays so.
+        settled: epoch from which on it stays within `tolerance`.
         trend: relative change per epoch over the last 10 epochs, by a line through the logarithms:
             -0.015 says that the error still falls by 1.5 % per epoch, so that the final value is
             not where training would end. NaN for curves of fewer than 3 epochs.
@@ -46,13 +46,13 @@ class Settling:
 
 
 def settling(mse: ArrayLike, *, tolerance: float = 0.05, final_over: int = 1) -> Settling:
-    """Measures when a validation curve has come near its final value.
+    """Measures when a validation curve comes near its final value.
 
     Args:
         mse: (epochs,) validation error after each epoch, every epoch from the first.
-        tolerance: how much above the final value counts as near, relative.
-        final_over: the final value is the mean of so many last epochs. With more than 1 the last
-            epochs may themselves lie above the tolerance; the curve then settles at its end.
+        tolerance: relative distance above the final value that counts as near.
+        final_over: number of last epochs whose mean is the final value. With more than 1 the last
+            epochs may be above the tolerance; the curve then settles at its end.
 
     Raises:
         InputError: an empty curve, values that are not positive and finite, or options out of
@@ -94,7 +94,7 @@ class Convergence:
     Attributes:
         curves: of each run.
         settled: mean epoch at which a run has settled, with a BCa bootstrap interval over runs.
-        reached: mean epoch at which a run is near its final value for the first time, likewise.
+        reached: mean of the first epoch at which a run is near its final value, with interval.
         median: of `settled` over runs.
     """
 
@@ -113,9 +113,9 @@ def convergence(
     resamples: int = 9999,
     seed: int = 0,
 ) -> Convergence:
-    """Measures when the validation curves of several runs have come near their final values.
+    """Measures when the validation curves of several runs come near their final values.
 
-    To compare two models, hand the epochs of both to `paired_comparison`.
+    To compare two models, pass the epochs of both to `paired_comparison`.
 
     Args:
         curves: one or more, each (epochs,); with fewer than 5 there are no intervals.
@@ -149,14 +149,14 @@ def convergence(
 
 @dataclass(frozen=True)
 class Enough:
-    """Whether a number of epochs follows from curves that go on beyond it.
+    """Whether a number of epochs is enough, by curves of longer trainings.
 
     Attributes:
         chosen: number of epochs that was chosen.
-        tolerance: how much above the final value counts as enough, relative.
+        tolerance: relative distance above the final value that counts as enough.
         ratios: per curve, error after the chosen epochs over the final error.
         settled: per curve, the epoch from which on it is within the tolerance.
-        enough: per curve, whether it has settled by the chosen epoch.
+        enough: per curve, whether it settles by the chosen epoch.
     """
 
     chosen: int
@@ -167,23 +167,23 @@ class Enough:
 
     @property
     def follows(self) -> bool:
-        """Every curve has settled by the chosen epoch."""
+        """Whether every curve settles by the chosen epoch."""
         return all(self.enough)
 
     @property
     def needed(self) -> int:
-        """Epochs after which every curve has settled."""
+        """Number of epochs after which every curve has settled."""
         return max(self.settled)
 
 
 def enough_epochs(
     curves: Sequence[ArrayLike], chosen: int, *, tolerance: float = 0.05, final_over: int = 1
 ) -> Enough:
-    """Measures whether a choice of epochs follows from longer trainings.
+    """Measures whether a number of epochs is enough, by longer trainings.
 
     Args:
         curves: one or more, each (epochs,) and longer than `chosen`.
-        chosen: number of epochs that is to be enough.
+        chosen: number of epochs to check.
         tolerance: as for `settling`.
         final_over: as for `settling`.
 
@@ -196,8 +196,8 @@ def enough_epochs(
     shortest = min(len(curve) for curve in checked)
     if not isinstance(chosen, int) or not 1 <= chosen < shortest:
         raise InputError(
-            f"the chosen number of epochs must lie below the {shortest} of the shortest curve, got "
-            f"{chosen!r}; whether training ended too early shows only beyond its end"
+            f"the chosen number of epochs must be below the {shortest} of the shortest curve, got "
+            f"{chosen!r}; a curve shows only beyond that epoch whether it was enough"
         )
     each = [settling(c, tolerance=tolerance, final_over=final_over) for c in checked]
     return Enough(

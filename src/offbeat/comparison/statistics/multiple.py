@@ -1,4 +1,4 @@
-"""Several tests at once."""
+"""Corrections for multiple tests."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from offbeat.errors import InputError
 
 
 def holm(p_values: ArrayLike) -> tuple[float, ...]:
-    """Adjusts the p-values of a family of tests: the chance of any false alarm is at most alpha.
+    """Adjusts the p-values of a family of tests; controls the family-wise error rate.
 
-    Holm, Scand. J. Stat. 6 (1979) 65. Needs no independence of the tests.
+    Holm, Scand. J. Stat. 6 (1979) 65. The tests need not be independent.
 
     Args:
         p_values: (tests,), each from 0 to 1.

@@ -1,6 +1,6 @@
-"""Comparisons of runs that belong together: both models saw the same windows and masks.
+"""Paired comparisons: both models were trained on the same windows and masks.
 
-What the draw of windows and masks does to both models alike falls out of the differences. So these
+The common effect of the draw of windows and masks cancels in the differences. So these
 tests, not those of `two_samples`, decide here.
 """
 
@@ -34,7 +34,7 @@ _EXACT_UP_TO = 50
 def paired_t(
     a: ArrayLike, b: ArrayLike, *, names: tuple[str, str] = ("first", "second")
 ) -> Outcome:
-    """Student's t test of the differences within pairs, which it takes to be normal.
+    """Student's t test of the differences within pairs, which it assumes to be normal.
 
     Raises:
         InputError: fewer than 3 pairs, unpaired, not finite, or equal differences.
@@ -69,7 +69,7 @@ def wilcoxon(
     if len(differences) > _EXACT_UP_TO:
         p = float(stats.wilcoxon(differences).pvalue)
     else:
-        # How many of the 2^n signs give each sum; ranks doubled, so that halves of ties are whole.
+        # Number of the 2^n signs that give each sum; ranks are doubled, so that ties are integers.
         doubled = np.rint(2 * ranks).astype(int)
         counts = np.zeros(int(doubled.sum()) + 1)
         counts[0] = 1.0
@@ -80,7 +80,7 @@ def wilcoxon(
 
 
 def small_sample_correction(df: float) -> float:
-    """The factor J that takes the bias out of Cohen's d.
+    """The factor J that corrects the bias of Cohen's d.
 
     J = Gamma(df / 2) / (sqrt(df / 2) Gamma((df - 1) / 2)), the exact form; Hedges, J. Educ. Stat. 6
     (1981) 107, about 1 - 3 / (4 df - 1).
@@ -103,14 +103,14 @@ def hedges_g(
     seed: int = 0,
     names: tuple[str, str] = ("first", "second"),
 ) -> Estimate:
-    """Hedges' g: the difference of two means in standard deviations, without the bias of few runs.
+    """Hedges' g: the difference of two means in standard deviations, corrected for few runs.
 
     Args:
         a: (runs,) of the first model.
         b: (runs,) of the second.
-        form: what one unit is, and whether the runs are paired. `average` (paired): the root of the
+        form: the unit, and whether the runs are paired. `average` (paired): the root of the
             mean of the two variances, Bonett, Psychol. Methods 13 (2008) 99; how large the
-            difference is beside the spread of a model over repeats. `difference` (paired): the
+            difference is relative to the spread of a model over repeats. `difference` (paired): the
             standard deviation of the differences; how steady the difference is from repeat to
             repeat. `independent`: the pooled standard deviation of unpaired samples. The correction
             J has n - 1 degrees of freedom where paired, else n_a + n_b - 2.
@@ -129,7 +129,7 @@ def hedges_g(
     else:
         first, second = sample(a, names[0]), sample(b, names[1])
     if form == "average" and equal(first) and equal(second):
-        sample(first, names[0])  # says what is wrong with it
+        sample(first, names[0])  # raises an error that names the cause
     df = len(first) - 1 if paired else len(first) + len(second) - 2
     factor, d = small_sample_correction(df), _D[form]
     return bca(
@@ -178,12 +178,12 @@ class PairedComparison:
         mean_a: mean of the first model.
         mean_b: mean of the second.
         difference: mean paired difference, with a BCa bootstrap interval.
-        difference_t: the same with Student's interval, which takes the differences to be normal.
+        difference_t: the same with Student's interval, which assumes normal differences.
         paired_t: Student's test of the differences.
         wilcoxon: Wilcoxon's signed-rank test.
-        wilcoxon_floor: the least p that so many pairs can give, 2^(1 - pairs).
+        wilcoxon_floor: the least p for this number of pairs, 2^(1 - pairs).
         shapiro_differences: Shapiro-Wilk on the differences, the assumption of `paired_t`.
-        correlation: Pearson's, of the pairs: how much they have in common; None where one model's
+        correlation: Pearson's correlation of the pairs; None where one model's
             values are all equal.
         hedges_g: in units of the models' spread over repeats (form `average`), with interval.
         hedges_gz: in units of the spread of the differences (form `difference`), with interval.
@@ -214,7 +214,7 @@ def paired_comparison(
     seed: int = 0,
     names: tuple[str, str] = ("first", "second"),
 ) -> PairedComparison:
-    """Compares two models whose runs belong together, place by place.
+    """Compares two models whose runs are paired by position.
 
     Args:
         a: (runs,) scores of the first model, at least 3; lower is better.

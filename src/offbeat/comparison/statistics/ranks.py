@@ -1,4 +1,4 @@
-"""More than two models at once: Friedman's test and Nemenyi's critical difference.
+"""Tests of more than two models: Friedman's test and Nemenyi's critical difference.
 
 Demsar, Statistical Comparisons of Classifiers over Multiple Data Sets, JMLR 7 (2006) 1.
 """
@@ -25,13 +25,13 @@ class FriedmanResult:
         average_ranks: per model; ties share their mean rank.
         friedman: chi-squared, corrected for ties, with k - 1 degrees of freedom.
         iman_davenport: the F of Iman and Davenport, Commun. Stat. A 9 (1980) 571, less
-            conservative; None where every block ranks the models alike, and F is infinite.
+            conservative; None where every block ranks the models equally, and F is infinite.
         critical_difference: Nemenyi's: average ranks that differ by at least this differ
             significantly.
         alpha: level of significance of the critical difference.
         nemenyi_p: (models, models) p-values of Nemenyi's test, 1 on the diagonal.
-        groups: maximal runs of models, best first, that differ by less than the critical
-            difference; those of one model are left out.
+        groups: maximal sets of neighbouring models, best first, that do not
+            differ significantly; sets of one model are left out.
     """
 
     names: tuple[str, ...]
@@ -84,13 +84,13 @@ def critical_difference(models: int, blocks: int, *, alpha: float = 0.05) -> flo
 
 
 def friedman(scores: Mapping[str, ArrayLike], *, alpha: float = 0.05) -> FriedmanResult:
-    """Tests whether models rank alike over blocks, and which differ by Nemenyi's test.
+    """Tests whether models rank equally, and which ones differ by Nemenyi's test.
 
     Friedman, J. Am. Stat. Assoc. 32 (1937) 675. The blocks must be independent of each other;
-    within a block nothing is assumed but that scores can be ranked.
+    within a block, scores need only be comparable by rank.
 
     Args:
-        scores: by model, (blocks,) with the same block at the same place; lower is better.
+        scores: by model, (blocks,) in the same order of blocks; lower is better.
         alpha: level of significance of the critical difference.
 
     Raises:
@@ -116,7 +116,7 @@ def friedman(scores: Mapping[str, ArrayLike], *, alpha: float = 0.05) -> Friedma
     blocks, k = table.shape
     if (np.ptp(table, axis=1) == 0).all():
         raise InputError(
-            f"all {k} models score alike in each of {blocks} repeats: there is nothing to rank"
+            f"all {k} models score equally in each of {blocks} repeats: there is nothing to rank"
         )
     chi_squared, p = stats.friedmanchisquare(*rows)
     ranks = stats.rankdata(table, axis=1).mean(axis=0)

@@ -1,4 +1,4 @@
-"""What a test is given and what it gives back: checked samples, outcomes, estimates."""
+"""Checked samples, and records of outcomes and estimates."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from offbeat.errors import InputError
 Sample: TypeAlias = NDArray[np.float64]
 
 FEWEST = 3
-"""Fewest runs per model that any test here takes: Shapiro-Wilk needs as many."""
+"""Minimum number of runs per model, which Shapiro-Wilk needs."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a test found.
+    """The outcome of a test.
 
     Attributes:
         name: of the test: `shapiro_wilk`, `welch_t`, ...
-        statistic: W, t, F or chi-squared, as the test has it.
+        statistic: W, t, F or chi-squared, depending on the test.
         p: two-sided p-value.
         df: degrees of freedom; empty where the test has none.
     """
@@ -39,9 +39,9 @@ class Estimate:
 
     Attributes:
         value: estimated.
-        low: lower end of the interval; None where there is too little to make one of.
-        high: upper end, likewise.
-        confidence: that the interval is made for, from 0 to 1.
+        low: lower end of the interval; None where there are too few values.
+        high: upper end; None where `low` is.
+        confidence: level of the interval, from 0 to 1.
         method: how the interval was made: `bca_bootstrap`, `student_t` or `f`.
     """
 
@@ -58,14 +58,14 @@ def sample(values: ArrayLike, name: str, *, at_least: int = FEWEST, vary: bool =
     Args:
         values: (runs,) one score per run.
         name: of the sample, for messages.
-        at_least: fewest runs that will do.
+        at_least: minimum number of runs.
         vary: refuse values that are all equal.
 
     Returns:
         (runs,) float64.
 
     Raises:
-        InputError: not one row of numbers, too few, not finite, or all equal.
+        InputError: not a list of numbers, too few, not finite, or all equal.
     """
     try:
         array = np.asarray(values, dtype=np.float64)
@@ -78,7 +78,7 @@ def sample(values: ArrayLike, name: str, *, at_least: int = FEWEST, vary: bool =
     if len(array) < at_least:
         raise InputError(
             f"{name!r} has {len(array)} {'run' if len(array) == 1 else 'runs'}, a comparison needs "
-            f"at least {at_least}; train more repeats, each under its own seed"
+            f"at least {at_least}; train more repeats, each with its own seed"
         )
     bad = ~np.isfinite(array)
     if bad.any():
@@ -90,7 +90,7 @@ def sample(values: ArrayLike, name: str, *, at_least: int = FEWEST, vary: bool =
     if vary and equal(array):
         raise InputError(
             f"all {len(array)} values of {name!r} are equal ({array[0]:g}): there is no spread to "
-            "test against; are they copies of one run, or were the seeds the same?"
+            "test against; check that they are not copies of one run"
         )
     return array
 
@@ -98,7 +98,7 @@ def sample(values: ArrayLike, name: str, *, at_least: int = FEWEST, vary: bool =
 def pairs(
     a: ArrayLike, b: ArrayLike, names: tuple[str, str], *, at_least: int = FEWEST
 ) -> tuple[Sample, Sample]:
-    """Checks two samples whose runs belong together, place by place.
+    """Checks two samples whose runs are paired by position.
 
     Raises:
         InputError: as for `sample`, lengths that differ, or the same difference in every pair.
@@ -114,13 +114,13 @@ def pairs(
     if equal(differences, scale=max(np.abs(first).max(), np.abs(second).max())):
         raise InputError(
             f"{names[0]!r} and {names[1]!r} differ by the same {differences[0]:g} in all "
-            f"{len(first)} pairs: there is no spread to test against; are they the same runs?"
+            f"{len(first)} pairs: there is no spread; check that they are different runs"
         )
     return first, second
 
 
 def equal(array: Sample, *, scale: float | None = None) -> bool:
-    """Whether values are equal but for rounding in float64."""
+    """Whether values are equal up to rounding in float64."""
     scale = float(np.abs(array).max()) if scale is None else scale
     return bool(np.ptp(array) <= 8 * np.finfo(np.float64).eps * scale)
 
@@ -132,5 +132,5 @@ def check_level(name: str, value: float) -> float:
         InputError: it is not strictly between 0 and 1.
     """
     if isinstance(value, bool) or not (isinstance(value, int | float) and 0 < value < 1):
-        raise InputError(f"{name} must lie between 0 and 1, got {value!r}; 0.05 means 5 %")
+        raise InputError(f"{name} must be between 0 and 1, got {value!r}; 0.05 means 5 %")
     return float(value)

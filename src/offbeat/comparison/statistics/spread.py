@@ -1,4 +1,4 @@
-"""How much two models scatter over repeats: the ratio of their standard deviations."""
+"""Comparison of the spread of two models over repeats."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from offbeat.comparison.statistics.two_samples import bartlett, levene
 
 @dataclass(frozen=True)
 class SpreadComparison:
-    """The spread of two models over runs; a ratio below 1 says that the first is the steadier.
+    """The spread of two models over runs; with a ratio below 1 the first varies less.
 
     Attributes:
         std_a: standard deviation of the first model, with n - 1.
@@ -30,7 +30,7 @@ class SpreadComparison:
         ratio_f: the same with the interval of the F distribution, for independent normal samples.
         f_test: F test of equal variances of independent normal samples.
         bartlett: the same by Bartlett's test.
-        levene: the same by Levene's test, which asks less of normality.
+        levene: the same by Levene's test, which is less sensitive to deviations from normality.
         pitman_morgan: the test for pairs, which decides where runs share windows and masks; None
             where they are not paired.
     """
@@ -60,7 +60,7 @@ def spread_comparison(
     Args:
         a: (runs,) scores of the first model, at least 3.
         b: (runs,) scores of the second.
-        paired: places belong together.
+        paired: the samples are paired by position.
         confidence: of the intervals.
         resamples: of the bootstrap; with fewer than 5 runs its interval is None.
         seed: of the bootstrap.
@@ -104,8 +104,8 @@ def pitman_morgan(
 ) -> Outcome:
     """Tests whether two normal samples of pairs have equal variances.
 
-    They have if sums and differences of the pairs are not correlated: Pitman, Biometrika 31 (1939)
-    9; Morgan, ibid. 13. A positive statistic says that the first scatters more.
+    They do if sums and differences of the pairs are uncorrelated: Pitman, Biometrika 31 (1939)
+    9; Morgan, ibid. 13. With a positive statistic the first varies more.
 
     Raises:
         InputError: samples that cannot be tested, or that do not pair.

@@ -1,7 +1,7 @@
-"""Tests of samples that are taken to be independent, and the thesis' rule for choosing one.
+"""Tests of independent samples, and the thesis' rule for choosing one.
 
 Runs that share windows and masks are not independent: see `paired` for the tests that decide.
-`scipy.stats` is imported when a test is made; it takes seconds.
+`scipy.stats` is imported when a test runs, because that takes seconds.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def shapiro_wilk(values: ArrayLike, *, name: str = "sample") -> Outcome:
 def bartlett(*samples: ArrayLike, names: tuple[str, ...] | None = None) -> Outcome:
     """Tests whether normal samples have equal variances.
 
-    Bartlett, Proc. R. Soc. A 160 (1937) 268. The thesis' equations 53 to 55. It takes a departure
-    from the normal distribution for one from equal variances; `levene` does so less.
+    Bartlett, Proc. R. Soc. A 160 (1937) 268. The thesis' equations 53 to 55. It is sensitive to
+    deviations from the normal distribution; `levene` is less so.
 
     Args:
         samples: two or more of shape (runs,), independent of each other.
@@ -111,14 +111,14 @@ class ThesisTest:
     """The thesis' rule (section 3.4) applied to two samples.
 
     Shapiro-Wilk on each sample, Bartlett on the pair, then the two-sample t test if Bartlett's
-    p > alpha, else Welch's. It takes the samples to be independent.
+    p > alpha, else Welch's. It assumes independent samples.
 
     Attributes:
         shapiro_a: of the first sample.
         shapiro_b: of the second.
         bartlett: of both.
-        levene: of both, beside the rule; less easily misled by samples that are not normal.
-        chosen: the t test that the rule chose: its name is `two_sample_t` or `welch_t`.
+        levene: of both, in addition to the rule; less sensitive to samples that are not normal.
+        chosen: the t test that the rule selects: its name is `two_sample_t` or `welch_t`.
         alpha: level of significance of every step.
     """
 
@@ -146,17 +146,17 @@ class ThesisTest:
 
     @property
     def normal(self) -> bool:
-        """Neither sample differs significantly from a normal one, as the rule presumes."""
+        """Whether neither sample differs significantly from a normal one, as the rule assumes."""
         return min(self.shapiro_a.p, self.shapiro_b.p) > self.alpha
 
     @property
     def equal_variances(self) -> bool:
-        """The variances do not differ significantly by Bartlett's test."""
+        """Whether Bartlett's test finds no significant difference of the variances."""
         return self.bartlett.p > self.alpha
 
     @property
     def significant(self) -> bool:
-        """The chosen test rejects equal means: p is at most alpha."""
+        """Whether the chosen test rejects equal means: p is at most alpha."""
         return self.p <= self.alpha
 
 
@@ -171,7 +171,7 @@ def thesis_test(
 
     Args:
         a: (runs,) scores of the first model, at least 3.
-        b: (runs,) scores of the second; there may be another number of them.
+        b: (runs,) scores of the second; its number of runs may differ.
         alpha: level of significance.
         names: of the models, for messages.
 
@@ -193,6 +193,6 @@ def thesis_test(
 
 def _several(samples: tuple[ArrayLike, ...], names: tuple[str, ...] | None) -> list[Sample]:
     if len(samples) < 2:
-        raise InputError(f"this compares at least 2 samples, got {len(samples)}")
+        raise InputError(f"expected at least 2 samples, got {len(samples)}")
     known = names or tuple(f"sample {i + 1}" for i in range(len(samples)))
     return [sample(one, name) for one, name in zip(samples, known, strict=True)]

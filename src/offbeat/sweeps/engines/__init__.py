@@ -1,4 +1,4 @@
-"""What runs the runs: processes of this machine, a Ray cluster, Slurm."""
+"""Engines that run the runs: local processes, a Ray cluster, Slurm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an engine is: it takes jobs, and says how each of them ended."""
+"""Interface of engines: take jobs, report how each of them ended."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from offbeat.errors import DivergenceError, OffbeatError
 
 
 class Job(Protocol):
-    """Something to do in any process: small, can be pickled, done once however often it runs."""
+    """A small, picklable task for any process; running it again does not repeat finished work."""
 
     @property
     def name(self) -> str:
-        """Of the job, unique within an engine."""
+        """Name of the job, unique within an engine."""
 
     def perform(self) -> None:
-        """Does it, or goes on where a process that was killed left off."""
+        """Does the job, or resumes where a killed process stopped."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a job did not succeed, in words that pass between processes.
+    """Why a job failed, in a form that can be sent between processes.
 
     Attributes:
         message: one line.
@@ -37,7 +37,7 @@ class Failure:
 
     @property
     def diverged(self) -> bool:
-        """The training left the finite numbers: other runs go on."""
+        """Whether the training diverged; other runs continue."""
         return issubclass(self.error, DivergenceError)
 
 
@@ -48,7 +48,7 @@ class Ending:
     Attributes:
         job: the job.
         failure: None if it is done.
-        lost: the process or machine that ran it is gone; the job can be given again.
+        lost: the process or machine that ran it was lost; the job can be submitted again.
     """
 
     job: Job
@@ -81,7 +81,7 @@ class Engine(ABC):
 
 
 def attempt(job: Job) -> Failure | None:
-    """Does a job and says how it went; what engines run in their processes."""
+    """Runs a job and returns its failure, if any; called by engines in their processes."""
     try:
         job.perform()
     except OffbeatError as error:
@@ -95,7 +95,7 @@ def attempt(job: Job) -> Failure | None:
 
 @contextmanager
 def threads_of_torch(threads: int) -> Iterator[None]:
-    """So many threads for torch, inside the block."""
+    """Sets the number of torch's threads inside the block."""
     import torch
 
     before = torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Processes of this machine, which live as long as the experiment and keep its data in memory."""
+"""Local processes that live as long as the sweep and keep its data in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from offbeat.data.memory import available_memory
 from offbeat.data.simulate import available_cores
 from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 
-_GIB_PER_PROCESS = 2.0  # data of the full protocol, its parts, torch: 1.7 at the peak
+_GIB_PER_PROCESS = 2.0  # 100 trajectories of 1000 rows, windows and torch: 1.7 at the peak
 
 
 class LocalEngine(Engine):
@@ -39,7 +39,7 @@ class LocalEngine(Engine):
         self._workers: list[_Worker] = []
 
     def submit(self, job: Job) -> None:
-        """Gives the job to an idle process; starts one if there is none."""
+        """Sends the job to an idle process; starts one if there is none."""
         for worker in self._workers:
             if worker.job is None:
                 break
@@ -51,11 +51,11 @@ class LocalEngine(Engine):
             worker = _Worker(process, ours)
             self._workers.append(worker)
         worker.job = job
-        with suppress(OSError):  # it has died while idle; `wait` finds the job lost
+        with suppress(OSError):  # it died while idle; `wait` reports the job as lost
             worker.pipe.send(job)
 
     def wait(self, seconds: float) -> list[Ending]:
-        """Waits until a process is done with its job or has died."""
+        """Waits until a process finishes its job or dies."""
         busy = [(worker, worker.job) for worker in self._workers if worker.job is not None]
         if not busy:
             return []
@@ -95,8 +95,8 @@ class _Worker:
 
 
 def _serve(pipe: Any) -> None:
-    """A process that does one job after another, and ends with the process that started it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # that one stops us
+    """Loop of a worker process: runs jobs until the parent process ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops this process
     tqdm.set_lock(threading.RLock())  # by default a semaphore, which a killed process leaves behind
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
@@ -116,6 +116,6 @@ def _end_with_parent() -> None:
 
 
 def _room() -> int:
-    """Processes that memory has room for, within the limits of the container."""
+    """Number of processes that fit in memory, within the limits of the container."""
     free = available_memory()
     return available_cores() if free is None else max(1, int(free / 2**30 / _GIB_PER_PROCESS))

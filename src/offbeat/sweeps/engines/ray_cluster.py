@@ -1,4 +1,4 @@
-"""A Ray cluster: the one that is running, or one of this machine."""
+"""A Ray cluster: a running one, or a local one."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
 
 
 class RayEngine(Engine):
-    """Jobs of Ray, whose workers keep the data in memory from one job to the next.
+    """Runs jobs on Ray; its workers keep the data in memory between jobs.
 
     Connects to the cluster that the environment names (`RAY_ADDRESS`) or that runs on this machine;
-    where there is none, it starts one here and ends it with the experiment.
+    where there is none, it starts a local one and ends it with the sweep.
 
     Args:
         processes: runs at a time; by default as many as the cluster's cores allow.
@@ -42,12 +42,12 @@ class RayEngine(Engine):
         cores = int(self._ray.cluster_resources().get("CPU", 1))
         self.capacity = processes or max(1, cores // threads)
         self.description = f"Ray on {where}, {self.capacity} at a time, {cores} cores"
-        # A lost worker's run is given again by the session, which counts how often.
+        # The session submits the run of a lost worker again, and counts how often.
         self._attempt = self._ray.remote(num_cpus=threads, max_retries=0)(attempt)
         self._jobs: dict[Any, Job] = {}
 
     def submit(self, job: Job) -> None:
-        """Gives the job to the cluster."""
+        """Submits the job to the cluster."""
         self._jobs[self._attempt.remote(job)] = job
 
     def wait(self, seconds: float) -> list[Ending]:
@@ -61,7 +61,7 @@ class RayEngine(Engine):
             try:
                 endings.append(Ending(job, self._ray.get(reference)))
             except self._ray.exceptions.RayTaskError:
-                raise  # `attempt` lets nothing through: the worker can't run Offbeat
+                raise  # `attempt` catches everything else: the worker can't run Offbeat
             except self._ray.exceptions.RayError:
                 endings.append(Ending(job, lost=True))
         return endings

@@ -16,7 +16,7 @@ _AT_A_TIME = 100  # below the number of jobs that clusters allow one user
 
 
 class SlurmEngine(Engine):
-    """A job per run. A job that is preempted or out of time is queued again, and goes on.
+    """Runs each run as a job. A job that is preempted or times out is queued again and resumes.
 
     Args:
         processes: jobs at a time, waiting ones too; by default 100 under Slurm, and on this machine
@@ -47,7 +47,7 @@ class SlurmEngine(Engine):
         self._given.append((self._executor.submit(_Submitted(), job), job))
 
     def wait(self, seconds: float) -> list[Ending]:
-        """Asks after the jobs until one has ended."""
+        """Polls the jobs until one has ended."""
         end = time.monotonic() + seconds
         while True:
             ended = [pair for pair in self._given if pair[0].done()]
@@ -66,13 +66,13 @@ class SlurmEngine(Engine):
 
 
 class _Submitted:
-    """What a job runs. submitit asks `checkpoint` before a job is taken away."""
+    """The callable of a job. submitit calls `checkpoint` before a job is preempted."""
 
     def __call__(self, job: Job) -> Any:
         return attempt(job)
 
     def checkpoint(self, job: Job) -> Any:
-        """The same again: the run's own checkpoints hold how far it has come."""
+        """Resubmits the same job, which resumes from the checkpoints of its run."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self, job)
@@ -84,6 +84,6 @@ def _ending(submitted: Any, job: Job) -> Ending:
     try:
         return Ending(job, submitted.result())
     except FailedJobError:
-        raise  # `attempt` lets nothing through: the node can't run Offbeat
+        raise  # `attempt` catches everything else: the node can't run Offbeat
     except UncompletedJobError:
         return Ending(job, lost=True)
