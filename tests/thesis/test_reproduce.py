@@ -520,7 +520,7 @@ def test_two_experiments_in_one_folder_are_refused(tmp_path):
     process = start(script(LONG, out, only=ONLY, processes=1))
     try:
         wait_until(lambda: (out / "status.json").exists(), process=process)
-        with pytest.raises(ob.InputError, match="another process works in"):
+        with pytest.raises(ob.InputError, match="another process uses"):
             reproduce(LONG, out, progress=False)
     finally:
         process.kill()

@@ -1,1 +1,1 @@
-"""Data: recorded or simulated trajectories, and their way to padded batches."""
+"""Data: recorded or simulated trajectories, their preparation, and padded batches."""

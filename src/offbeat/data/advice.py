@@ -17,14 +17,14 @@ from offbeat.data.transforms import full_turn, is_angle_unit, lowest_of
 
 _ROWS = 100  # of a window, unless a slow sensor needs more
 _MOST_ROWS = 1000
-_SLOW_VALUES = 5  # least values of the slowest sensor in a window
+_SLOW_VALUES = 5  # minimum number of values of the slowest sensor in a window
 _FEWEST_WINDOWS = 20
 _FEWEST_EPISODES = 10  # for a split by trajectory
 
 
 @dataclass(frozen=True)
 class Advice:
-    """A command line of `train`.
+    """A recommended command line of `train`.
 
     Attributes:
         command: its words, to be joined with `shlex.join`.
@@ -35,7 +35,7 @@ class Advice:
     reasons: tuple[str, ...]
 
     def __str__(self) -> str:
-        """The command line, broken at its options."""
+        """The command line, with a line break before each option."""
         lines = [list(self.command[:4])]
         for word in self.command[4:]:
             lines[-1].append(word) if not word.startswith("--") else lines.append([word])
@@ -53,8 +53,8 @@ def advise(
     """Chooses options of `train` for a data set.
 
     Args:
-        dataset: as it was read.
-        data: its file, as the command line names it.
+        dataset: as read.
+        data: its file, for the command line.
         out: folder of the run.
         reader: options that it was read with.
         known: the options that its format has.
@@ -63,7 +63,7 @@ def advise(
     reasons: list[str] = []
     inspection = inspect(dataset)
     useful = _useful(inspection)
-    # A quaternion needs all four channels, constant ones too.
+    # A quaternion needs all four channels, including constant ones.
     fours = inspection.cleaning.get("quaternions", {}).get("channels", ())
     needed = {name for four in fours for name in four} | {channel.name for channel in useful}
     useless = [channel.name for channel in inspection.channels if channel.name not in needed]
@@ -80,7 +80,7 @@ def advise(
             f"repeated: {listed(repeated)} repeat their values; a masked repeat is not scored as "
             "a measurement, which the last value would predict exactly"
         )
-        # What follows must hold for the data as they will be read.
+        # The following options depend on the data as they will be read.
         inspection = inspect(without_repeats(dataset))
     wrapping = _wrapping(dataset)
     if wrapping and "angles" in known:
@@ -174,6 +174,6 @@ def _text(value: Any) -> str:
 
 
 def _quoted(text: str) -> str:
-    """As YAML reads it."""
+    """Quotes a string for YAML."""
     plain = text.replace("_", "").replace(".", "").isalnum() and text[0].isalpha()
     return text if plain else json.dumps(text)

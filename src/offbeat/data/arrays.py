@@ -1,4 +1,4 @@
-"""Arrays that records own: copied from the caller's, and read-only."""
+"""Read-only arrays that records own."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 
 def frozen(value: Any, dtype: Any) -> NDArray[Any]:
-    """Returns a read-only array that nothing else can write to; copies where that is needed.
+    """Returns a read-only array that nothing else can write to; copies if needed.
 
-    Nothing is copied that is new (a list, another type of number) or that is read-only already,
-    down to the array that owns the memory, such as a slice of a record's own array.
+    No copy is made of an array that is new (from a list or another dtype) or read-only,
+    including the array that owns the memory, such as a slice of a record's array.
 
     Raises:
         TypeError, ValueError: `value` cannot be converted to `dtype`.
@@ -26,9 +26,9 @@ def frozen(value: Any, dtype: Any) -> NDArray[Any]:
 
 
 def hand_over(array: NDArray[Any]) -> NDArray[Any]:
-    """Hands an array over to the records that are made from it, which then need no copy.
+    """Makes an array read-only, so that records made from it need no copy.
 
-    The array, and those that it is a view of, become read-only. Call it last, on arrays that
+    The array and the arrays that it is a view of become read-only. Call it last, on arrays that
     nothing else writes to.
     """
     part: Any = array

@@ -1,4 +1,4 @@
-"""Padded tensors, the only place that pads; and times since observation, from times and masks."""
+"""Padded batches, and times since observation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
 
 STATE, ACTION, EXOGENOUS = "state", "action", "exogenous"
-"""Roles of channels: seen and predicted; predicted and seen one row later; seen only."""
+"""Roles of channels: observed and predicted; predicted, observed one row later; observed only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Batch:
         times: (batch, rows) float64, s, relative to the first row; padding repeats the last time.
         values: (batch, rows, channels) scaled; 0 where not known.
         mask: (batch, rows, channels) bool, True = observed.
-        known: (batch, rows, channels) bool, True = the score knows the value.
+        known: (batch, rows, channels) bool, True = the value is known, and can be scored.
         valid: (batch, rows) bool, False = padding.
         roles: per channel `state`, `action` or `exogenous`; by default all are `state`.
     """
@@ -55,7 +55,7 @@ class Batch:
 
         Args:
             trajectories: at least one; all of the same channels.
-            scaler: applied to the values; None leaves them in their units.
+            scaler: applied to the values; None for no scaling.
             dtype: of `values`; times are always float64.
             roles: of the channels; by default those of the trajectories.
 
@@ -123,7 +123,7 @@ class Batch:
 
     @property
     def targets(self) -> Tensor:
-        """(batch, rows, channels) bool, True where a prediction can be scored: known and wanted."""
+        """(batch, rows, channels) bool, True where a prediction can be scored."""
         known = self.known & self.valid[..., None]
         if all(role != EXOGENOUS for role in self.roles):
             return known
@@ -131,14 +131,14 @@ class Batch:
         return known & torch.tensor(wanted, device=known.device)
 
     def inputs(self, last: Tensor, seen: Tensor) -> Batch:
-        """What a model may look at on arrival at each row: an action is seen one row later.
+        """Inputs of a model: actions are moved to the next row.
 
-        An action is chosen at its row, from what is observed there. So it is a target of its own
-        row and an input of the next.
+        An action is chosen at its row from the observation there. So it is a target of that
+        row, and an input of the next row.
 
         Args:
             last: (batch, channels) actions of the row before the first.
-            seen: (batch, channels) bool, where there were any.
+            seen: (batch, channels) bool, True where there were any.
 
         Returns:
             The batch with the values and masks of `action` channels moved by one row; `known` is
@@ -173,7 +173,7 @@ def last_index(mask: Tensor) -> Tensor:
     Returns:
         (..., rows, channels) int64.
     """
-    if mask.shape[-2] == 1:  # a stream: nothing is before its one row
+    if mask.shape[-2] == 1:  # a stream has one row, with nothing before it
         return torch.full_like(mask, -1, dtype=torch.int64)
     rows = torch.arange(mask.shape[-2], device=mask.device)[:, None]
     latest = torch.where(mask, rows, -1).cummax(dim=-2).values
@@ -186,7 +186,7 @@ def delta(times: Tensor, mask: Tensor, *, since: Tensor | None = None) -> Tensor
     Args:
         times: (..., rows) float64, s.
         mask: (..., rows, channels) bool, True = observed.
-        since: (..., channels) s, what the time counts from before a channel's first observation;
+        since: (..., channels) s, the reference time before a channel's first observation;
             by default the time of the first row, as in equation 25.
 
     Returns:
@@ -204,7 +204,7 @@ def last_values(values: Tensor, mask: Tensor, *, before: Tensor) -> Tensor:
     Args:
         values: (..., rows, channels).
         mask: (..., rows, channels) bool, True = observed.
-        before: broadcasts to (..., 1, channels); is used before the first observation.
+        before: (..., 1, channels) or broadcastable, the values before the first observation.
 
     Returns:
         (..., rows, channels).

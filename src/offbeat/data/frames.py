@@ -1,4 +1,4 @@
-"""Data sets from and to data frames of pandas."""
+"""Conversion of data sets from and to pandas."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from offbeat.errors import InputError, MissingExtraError, one_of
 
 
 def to_pandas(dataset: Dataset) -> Any:
-    """Makes a data frame: a row per time, columns `trajectory`, `time` and one per channel.
+    """Converts a data set to a data frame.
 
     A value is NaN where it is not observed, as `from_pandas` reads it. Values that are known and
     masked are lost; units and roles are in the frame's `attrs`.
@@ -50,20 +50,20 @@ def from_pandas(
     units: Mapping[str, str] | None = None,
     roles: Mapping[str, str] | None = None,
 ) -> Dataset:
-    """Makes a data set of a data frame with a row per time.
+    """Converts a data frame with a row per time to a data set.
 
     Args:
-        frame: a `pandas.DataFrame`; its columns are channels of numbers, but for `time` and `by`.
+        frame: a `pandas.DataFrame`; all columns except `time` and `by` are numeric channels.
         time: column of times: seconds, or time stamps or durations of pandas.
-        by: column that says to which trajectory a row belongs; by default `trajectory` where there
+        by: column with the trajectory of each row; by default `trajectory` where there
             is one, else the frame is one trajectory. Trajectories are in the order of their first
             rows.
         units: unit by channel; by default those of `frame.attrs["units"]`, else empty.
         roles: role by channel; by default those of `frame.attrs["roles"]`, else `state`.
 
     Returns:
-        The data set; its times are those of the frame where they are numbers, and count from the
-        first row of each trajectory where they are time stamps.
+        The data set; its times are those of the frame if they are numbers, and count from the
+        first row of each trajectory if they are time stamps.
 
     Raises:
         InputError: a column is missing or holds no numbers, or times do not increase strictly

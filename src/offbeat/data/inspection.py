@@ -27,16 +27,16 @@ class ChannelInspection:
         missing: fraction of the rows in which it is not known.
         rate_hz: one over the median time between two known values; None below two.
         jitter_s: half the distance from the 5th to the 95th percentile of those times.
-        lost: fraction of the values that its rate would give between its first and last one, and
-            that are missing; 0 where there are more.
+        lost: fraction of the values expected from its rate between its first and last one
+            that are missing; 0 if there are more values.
         longest_gap_s: the longest time between two known values of an episode.
-        longest_gap_at: the episode, counted from 0, and the time in it at which that gap begins.
+        longest_gap_at: the episode, counted from 0, and the time in it at which that gap starts.
         rows_per_value: usual length of its runs of equal values, where a faster recording repeats
             the values of a slower sensor, else 0.
-        repeated_fraction: fraction of known values that equal the one before.
-        low: its least value; None where it is never known.
-        high: its greatest.
-        mean: its mean.
+        repeated_fraction: fraction of known values that equal the previous one.
+        low: its lowest value; None if it is never known.
+        high: its highest value.
+        mean: its mean value.
         constant: whether it has a single value.
     """
 
@@ -63,12 +63,12 @@ class EpisodeInspection:
     """An episode.
 
     Attributes:
-        label: as the file has it, or empty.
+        label: from the file, or empty.
         origin: where it came from.
         rows: of all its channels together.
         duration_s: from the first to the last row.
         longest_step_s: the longest time between two rows.
-        outage_before_s: the outage at which it was cut from the episode before; None where none is.
+        outage_before_s: the outage between the previous episode and this one, or None.
         clock_set_before: whether the clock was set before it.
         late: rows out of order.
         duplicates: rows with the time stamp of another row.
@@ -87,19 +87,19 @@ class EpisodeInspection:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a data set holds.
+    """The contents of a data set.
 
     Attributes:
-        source: the file, where it is known.
+        source: the file, if known.
         format: of the file.
-        time_unit: that the file counts in.
+        time_unit: unit of times in the file.
         rows: of all episodes together.
         known: fraction of the values that are known.
         rate_hz: one over the median time between two rows; None where no episode has two.
         channels: one entry each.
         episodes: one entry each.
-        found: what was found and done while reading, a sentence each.
-        cleaning: the same in full, see `CleaningLog`; empty for data that were not read.
+        found: sentences on what was found and changed while reading.
+        cleaning: the full record, see `CleaningLog`; empty for data that were not read.
     """
 
     source: str
@@ -120,10 +120,10 @@ class Inspection:
 
 
 def inspect(dataset: Dataset) -> Inspection:
-    """Measures what a data set holds, on the values that are known.
+    """Inspects a data set: rates, gaps, repeated values and anomalies of its known values.
 
     Args:
-        dataset: as `read` gives it.
+        dataset: from `read`.
     """
     steps = np.concatenate([np.diff(t.times) for t in dataset])
     rows = sum(t.rows for t in dataset)
@@ -145,7 +145,7 @@ def inspect(dataset: Dataset) -> Inspection:
 
 
 def without_repeats(dataset: Dataset) -> Dataset:
-    """The data set as `read` gives it with `repeated="mask"`: repeated values are not known."""
+    """The data set with repeated values as not known, as from `read` with `repeated="mask"`."""
     columns = [t.values.copy() for t in dataset]
     for c, role in enumerate(dataset.roles):
         found = None if role == "action" else find_repeats([v[:, c] for v in columns])
@@ -233,7 +233,7 @@ def _jitter(steps: NDArray[np.float64]) -> float | None:
 
 
 def _lost(steps: NDArray[np.float64]) -> float:
-    """Fraction of the values that the median step would give, and that are missing."""
+    """Fraction of the values expected from the median step that are missing."""
     if not len(steps):
         return 0.0
     expected = float(steps.sum()) / float(np.median(steps))

@@ -1,4 +1,4 @@
-"""Masking: values stay known to the score, and the model does not see them."""
+"""Masking: hides observed values from the model; they stay known for scoring."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def mask_out(
 
     - `rows` masks rows at random, all channels together.
     - `bursts` masks runs of consecutive such rows, all channels together.
-    - `values` masks the values of each channel at random, independently: the fraction holds in each
-      channel, which keeps at least one value.
+    - `values` masks the values of each channel at random, independently: the fraction applies to
+      each channel, which keeps at least one value.
     - `dropout` masks runs of each sensor independently: a sensor is a group of channels, the
-      fraction holds for the rows in which it reports, and at least one of them stays.
+      fraction applies to the rows in which it reports, and at least one of them stays.
 
-    Runs do not touch each other, are placed uniformly, and are as long as asked for; the last one
-    in time is shortened where the fraction is reached.
+    Runs do not touch, are placed uniformly, and have the given length; the last one
+    in time is shortened to reach the fraction.
 
     Args:
         dataset: trajectories to mask.
@@ -52,11 +52,11 @@ def mask_out(
         sensors: names of the channels of each sensor; channels of no sensor are not masked. By
             default channels with the same mask in the whole data set are one sensor, and each
             channel is one where all have the same mask.
-        seed: of the draw.
+        seed: of the masks.
 
     Raises:
         InputError: the fraction is not above 0 and at most 1, it would leave no row, an option is
-            given that this kind of mask does not have, or runs are too short to lie apart.
+            given that this kind of mask does not have, or runs are too short to be separated.
     """
     if not 0 < observed_fraction <= 1:
         raise InputError(
@@ -90,7 +90,7 @@ def mask_out(
 
 
 def sensors_of(dataset: Dataset) -> list[list[str]]:
-    """States that were always observed together, as groups of names, in order of the channels.
+    """Groups of states that are always observed together, in the order of the channels.
 
     Args:
         dataset: recordings in which sensors report at different times.
@@ -154,7 +154,7 @@ def _groups(
 
 
 def _count(rows: int, fraction: float, mask: str, trajectory: int) -> int:
-    """How many of so many rows stay observed."""
+    """Number of rows that stay observed."""
     # 0.29 * 100 is 28.999...: rounded, so that it counts as 29.
     count = int(round(rows * fraction, 9))
     if mask in ("values", "dropout"):
@@ -174,7 +174,7 @@ def _outside_bursts(
     burst_s: float | None,
     random: np.random.Generator,
 ) -> NDArray[np.bool_]:
-    """(rows,) True at exactly `keep` rows; the others lie in runs, with kept rows between them."""
+    """(rows,) True at exactly `keep` rows; the others form runs with kept rows between them."""
     masked = len(times) - keep
     if masked == 0:
         return np.ones(len(times), dtype=bool)
@@ -184,15 +184,15 @@ def _outside_bursts(
     else:
         # With a tolerance: a run of 50 ms has ten rows on a grid of 5 ms.
         ends = np.searchsorted(times, times + burst_s * (1 - 1e-9))
-    # A run goes before the first kept row, between two of them, or after the last one.
+    # A run is before the first kept row, between two of them, or after the last one.
     places = random.permutation(keep + 1)
     enough, few = 1, 0
     while not (tried := _runs(np.sort(places[:enough]), keep, ends))[1]:
         if enough == len(places):
             length = f"{burst_rows} rows" if burst_s is None else f"{burst_s} s"
             raise InputError(
-                f"bursts of {length} cannot mask {masked} of {len(times)} rows and lie apart; use "
-                "longer bursts, a larger observed_fraction, or mask 'rows'"
+                f"bursts of {length} cannot mask {masked} of {len(times)} rows and be apart; "
+                "use longer bursts, a larger observed_fraction, or mask 'rows'"
             )
         enough, few = min(2 * enough, len(places)), enough
     runs = tried[0]
@@ -209,7 +209,7 @@ def _outside_bursts(
 def _runs(
     places: NDArray[np.int64], keep: int, ends: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], bool]:
-    """Masks a run after so many kept rows each; True if that masks all but `keep` rows."""
+    """Masks runs at these positions; True if that masks all but `keep` rows."""
     masked = np.zeros(len(ends), dtype=bool)
     left = len(ends) - keep
     for place in places:

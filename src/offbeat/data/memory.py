@@ -1,4 +1,4 @@
-"""Checks that a file fits into memory before it is read; else the system may end the process."""
+"""Checks that a file fits into memory before it is read."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ _PER_VALUE, _PER_ROW = 9, 32  # bytes: a value and its mask; stamps, times and s
 def require_rows(
     path: Path, rows: int, channels: int, instead: str = "choose channels=", *, copies: int = 1
 ) -> None:
-    """Checks that a data set of so many rows and channels fits into memory.
+    """Checks that a data set fits into memory.
 
     Args:
         path: the file, for messages.
         rows: of all trajectories.
         channels: that are read.
-        instead: what reads less, for messages.
-        copies: how often the values are in memory while the file is read.
+        instead: advice on reading less, for messages.
+        copies: number of copies of the values in memory while the file is read.
 
     Raises:
-        FileFormatError: it does not.
+        FileFormatError: it does not fit.
     """
     need = copies * rows * (channels * _PER_VALUE + _PER_ROW)
     require_memory(path, need, f"{rows} rows x {channels} channels", instead)
 
 
 def require_memory(path: Path, need: int, what: str, instead: str = "") -> None:
-    """Checks that so many bytes are available.
+    """Checks that enough memory is available.
 
     Args:
         path: the file, for messages.
         need: bytes.
-        what: the file holds, for messages.
-        instead: what reads less, for messages.
+        what: contents of the file, for messages.
+        instead: advice on reading less, for messages.
 
     Raises:
-        FileFormatError: they are not.
+        FileFormatError: not enough memory is available.
     """
     free = available_memory()
     if free is not None and need > free:
@@ -53,10 +53,10 @@ def require_memory(path: Path, need: int, what: str, instead: str = "") -> None:
 
 
 def available_memory() -> int | None:
-    """Bytes that this process can still take before the system ends it; None where unknown.
+    """Bytes that this process can still allocate; None if unknown.
 
-    What the system has left (on Linux), and what is left of the limits of the control
-    groups, versions 1 and 2, that the process is in.
+    The minimum of the system's available memory (on Linux) and the remaining limits of the control
+    groups of the process, versions 1 and 2.
     """
     return min((*_of_system(), *_of_groups()), default=None)
 
@@ -68,7 +68,7 @@ def _of_system() -> Iterator[int]:
 
 
 def _of_groups() -> Iterator[int]:
-    """What is left of each limit, from the group of this process to the root."""
+    """The remainder of each limit, from the group of this process to the root."""
     for line in _lines(_PROC / "self" / "cgroup"):
         number, controllers, place = [*line.split(":", 2), "", ""][:3]
         if number == "0" and not controllers:
@@ -85,7 +85,7 @@ def _of_groups() -> Iterator[int]:
         for folder in (group, *group.parents):
             most, used = _number(folder / limit), _number(folder / usage)
             if most is not None and used is not None:
-                # The system drops copies of files before it ends a process.
+                # The system frees the file cache before it kills a process.
                 statistics = _fields(folder / "memory.stat")
                 kinds = ("active_file", "inactive_file")
                 files = sum(
@@ -110,7 +110,7 @@ def _fields(path: Path) -> dict[str, int]:
 
 
 def _number(path: Path) -> int | None:
-    """The number that a file holds; None if it holds none, such as `max`, or is not there."""
+    """The number in a file; None if it is not a number, such as `max`, or the file is missing."""
     lines = _lines(path)
     return int(lines[0]) if lines and lines[0].strip().isdecimal() else None
 

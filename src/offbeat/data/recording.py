@@ -1,8 +1,8 @@
-"""How recordings become a data set, the same for every file format.
+"""Conversion of recordings to a data set, the same for all file formats.
 
-A reader gives what a file holds, as it was logged: a `Recording` per file or episode, with a
-`Signal` per sensor, topic or table. `assemble` cleans them as `ReaderOptions` say, counts what it
-did in a log, and merges signals of different rates on the union of their time stamps.
+A reader returns the contents of a file as logged: a `Recording` per file or episode, with a
+`Signal` per sensor, topic or table. `assemble` cleans them by `ReaderOptions`, records the
+changes in a log, and merges signals of different rates on the union of their time stamps.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from offbeat.errors import FileFormatError
 
 
 def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = None) -> Dataset:
-    """Makes a data set of recordings: merges their signals and cleans them.
+    """Makes a data set from recordings: merges their signals and cleans them.
 
     In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
     outages; actions, repeated values, angles and quaternions per episode; resampling. Whether a
     channel repeats its values is found over all recordings together.
 
     The arrays of a recording with one signal and nothing to clean become those of its trajectory,
-    and read-only; else there is at most one copy of the recordings beside the result.
+    and read-only; otherwise there is at most one copy of the recordings besides the result.
 
     Args:
         recordings: at least one, with a row; all are read before anything is returned.
@@ -48,7 +48,7 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
         clock at time 0, in `time_unit`, where that is not 0), each with an entry per trajectory.
 
     Raises:
-        FileFormatError: an option refuses what was found, or nothing is left.
+        FileFormatError: an option refuses an anomaly, or no row is left.
         InputError: an option names a channel that does not exist.
     """
     options = options or ReaderOptions()
@@ -71,7 +71,7 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
             f"(min_rows {options.min_rows}); check the file, or give a smaller min_rows"
         )
     for episode in episodes:
-        _hold_actions(episode, channels)
+        _extend_actions(episode, channels)
     _mask_repeats(episodes, channels, options, log)
     if options.unwrap:
         _unwrap(episodes, channels, log)
@@ -81,7 +81,7 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
     if options.resample_hz is not None:
         for episode in episodes:
             _resample(episode, options.resample_hz)
-            _hold_actions(episode, channels)
+            _extend_actions(episode, channels)
     for episode in episodes:
         hand_over(episode.values)
     trajectories = tuple(episode.trajectory(channels, options) for episode in episodes)
@@ -95,8 +95,8 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
     return Dataset(trajectories, {**meta, "cleaning": log.to_dict(options, found)})
 
 
-def _hold_actions(episode: Episode, channels: Channels) -> None:
-    """Gives each row the action that holds then: the last one up to it, or the first one."""
+def _extend_actions(episode: Episode, channels: Channels) -> None:
+    """Sets the action of each row to the last one up to it, or to the first one."""
     for c, role in enumerate(channels.roles):
         missing = np.isnan(episode.values[:, c])
         if role != "action" or not missing.any() or missing.all():
@@ -148,7 +148,7 @@ def _make_continuous(episode: Episode, channels: Channels, log: CleaningLog) -> 
 
 
 def _resample(episode: Episode, rate_hz: float) -> None:
-    """Rows at a fixed rate from the first stamp on, with the last values since the row before."""
+    """Resamples at a fixed rate from the first stamp, with the last values since each row."""
     since = episode.stamps - episode.stamps[0]
     rows = int(np.ceil(since[-1] * rate_hz / 1e9 - 1e-6)) + 1
     grid = np.rint(np.arange(rows) * (1e9 / rate_hz)).astype(np.int64)
@@ -161,7 +161,7 @@ def _resample(episode: Episode, rate_hz: float) -> None:
 
 
 def _clock(episode: Episode, unit: str) -> int | float:
-    """What the recording's clock showed at the first row, in `unit`."""
+    """The recording's clock at the first row, in `unit`."""
     own = NANOSECONDS_PER[episode.recording.time_unit]
     factor = NANOSECONDS_PER[unit]
     nanoseconds = int(episode.stamps[0]) + episode.recording.clock_zero * own

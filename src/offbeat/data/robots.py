@@ -1,7 +1,7 @@
-"""The robots that can be simulated, as MuJoCo models with a draw of initial states.
+"""Robots for simulation: MuJoCo models with a distribution of initial states.
 
 The built-in ones are models of the DeepMind Control Suite. Their files come with the `dm_control`
-package, which is found and not imported: that takes seconds and chooses a rendering backend.
+package, which is not imported, because that takes seconds and selects a rendering backend.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Draw = Callable[[np.random.RandomState, Any, int], NDArray[np.float64]]
 """Draws (n, nq + nv) initial states for a `mujoco.MjModel`: positions, then velocities, in SI."""
 
 Control = Callable[[float, NDArray[np.float64]], NDArray[np.float64]]
-"""Gives the (nu,) controls at a time (s) for the (nq + nv,) positions and velocities then."""
+"""Maps a time (s) and the (nq + nv,) positions and velocities to (nu,) controls."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Robot:
     """A robot: its model, the distribution of its initial states, and its controller.
 
     Args:
-        name: for lists, channels' origins and `meta`.
+        name: for lists, origins of trajectories and `meta`.
         model: MJCF file, or a function that makes the `mujoco.MjModel`.
-        draw: draws initial states, trajectory by trajectory, so that the first k of n trajectories
-            do not depend on n. By default joints with limits anywhere in their range, hinges
-            without at any angle, and velocities of up to 1 in SI units.
+        draw: draws initial states in the order of trajectories, so that the first k of n
+            trajectories do not depend on n. By default joints with limits are uniform in their
+            range, hinges without limits have any angle, and velocities are up to 1 in SI units.
         control: by default no control.
         description: one line, for lists.
     """
@@ -52,7 +52,8 @@ class Robot:
         """(n, nq + nv) initial states.
 
         Raises:
-            InputError: the sampler gives another shape, or there is none for such joints.
+            InputError: the sampler returns another shape, or the default does not support the
+                joints.
         """
         states = np.asarray((self.draw or inside_joint_ranges(1.0))(random, model, n))
         if states.shape != (n, model.nq + model.nv):
@@ -79,10 +80,10 @@ def register_robot(
     description: str = "",
     replace: bool = False,
 ) -> Robot:
-    """Adds a robot to those that `simulate` knows by name.
+    """Registers a robot for `simulate`.
 
     Args:
-        name: what users say.
+        name: of the robot.
         model: as of `Robot`.
         draw: as of `Robot`.
         control: as of `Robot`.
@@ -96,7 +97,7 @@ def register_robot(
 
 
 def robot_of(robot: str | Path | Robot) -> Robot:
-    """A robot by its name, or of an MJCF file.
+    """A robot by its name, or from an MJCF file.
 
     Raises:
         InputError: it is neither; the message lists the names.
@@ -116,7 +117,7 @@ def load_model(robot: str | Path | Robot) -> Any:
 
     Raises:
         InputError: the robot is unknown.
-        FileFormatError: the file is missing or no MJCF.
+        FileFormatError: the file is missing or not MJCF.
         MissingExtraError: mujoco or dm_control is not installed.
     """
     source = robot_of(robot).model
@@ -133,9 +134,9 @@ def load_model(robot: str | Path | Robot) -> Any:
 
 
 def _box(*sides: tuple[int, float, float]) -> Draw:
-    """Independent uniform draws: (how many entries, low, high) per side of the box.
+    """Independent uniform draws: (number of entries, low, high) per side of the box.
 
-    One call of `uniform` with arrays gives, bit for bit, what a call per side gives.
+    One call of `uniform` with arrays equals one call per side bit for bit.
     """
     counts, lows, highs = zip(*sides, strict=True)
     low, high = np.repeat(lows, counts), np.repeat(highs, counts)
@@ -147,7 +148,7 @@ def _box(*sides: tuple[int, float, float]) -> Draw:
 
 
 def inside_joint_ranges(speed: float) -> Draw:
-    """Draws joints with limits in their range, other hinges at any angle, and leaves other slides.
+    """Draws joints with limits in their range, other hinges at any angle, and no other slides.
 
     Velocities are uniform in plus or minus `speed`.
     """
@@ -177,7 +178,7 @@ def _suite_model(xml: str) -> Callable[[], Any]:
         suite = _suite_folder()
         try:
             text = (suite / xml).read_text(encoding="utf-8")
-            # The suite's models include these under exactly this spelling.
+            # The suite's models include these by exactly these names.
             common = sorted((suite / "common").glob("*.xml"))
             assets = {f"./common/{file.name}": file.read_bytes() for file in common}
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Scaling of values, per channel."""
+"""Scaling of channels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCALERS: tuple[str, ...] = ("standardise", "min_max", "divide_by_max", "identity
 class Scaler:
     """An affine map per channel: scaled = (value - shift) / scale.
 
-    It is fitted on the training part and saved with the model. It owns its arrays, which are
+    It is fitted on the training part and saved with the model. Its arrays are
     read-only.
 
     Args:
@@ -47,7 +47,7 @@ class Scaler:
 
     @classmethod
     def identity(cls, channels: int) -> Scaler:
-        """Leaves values as they are."""
+        """Does not change values."""
         return cls("identity", np.zeros(channels), np.ones(channels))
 
     @classmethod
@@ -90,7 +90,7 @@ class Scaler:
         return values * self.scale + self.shift
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form; floats survive to the last bit."""
+        """JSON-like form; floats are exact."""
         return {"kind": self.kind, "shift": self.shift.tolist(), "scale": self.scale.tolist()}
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The schema of a stored data set: what the columns of its table cannot say, kept as metadata."""
+"""The schema of a stored data set, kept in the metadata of its table."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError
 
 SCHEMA_VERSION = 2
-"""Raised when files are written that earlier versions would misread.
+"""Increased when earlier versions would misread new files.
 
 Version 1, of Offbeat 0.1.0, has no roles, and columns of actions (`action|0`, ...) beside those of
 the channels; when it is read, they become channels with the role `action`.
@@ -59,7 +59,7 @@ class Schema:
 
     @classmethod
     def of(cls, dataset: Dataset) -> Schema:
-        """The schema of a data set that is to be written.
+        """The schema of a data set to write.
 
         Raises:
             InputError: a channel has the name of another column.
@@ -123,10 +123,10 @@ class Schema:
         return schema
 
     def to_metadata(self) -> dict[bytes, bytes]:
-        """What `from_metadata` reads.
+        """Metadata that `from_metadata` reads.
 
         Raises:
-            InputError: `meta` would not come back as it is.
+            InputError: `meta` cannot be restored exactly.
         """
         try:
             text = json.dumps(asdict(self), allow_nan=False)
@@ -137,7 +137,7 @@ class Schema:
             ) from None
         if json.loads(text)["meta"] != self.meta:
             raise InputError(
-                "meta of a data set would not come back from a file as it is; "
+                "meta of a data set cannot be restored exactly from a file; "
                 "use lists, not tuples, and strings as keys"
             )
         return {METADATA_KEY: text.encode(), CHECKSUM_KEY: _checksum(text.encode())}
@@ -160,7 +160,7 @@ class Schema:
         return pa.schema([pa.field(name, types.get(name, pa.float64())) for name in self.columns])
 
     def check_columns(self, arrow: Any, path: Path) -> None:
-        """Compares with the columns that a file has, a `pyarrow.Schema`.
+        """Checks the columns of a file, a `pyarrow.Schema`.
 
         Raises:
             FileFormatError: names or types differ.
@@ -177,7 +177,7 @@ class Schema:
 
 
 def _upgraded(fields: dict[str, Any]) -> dict[str, Any]:
-    """The schema of version 1 in the form of version 2."""
+    """Converts the schema of version 1 to version 2."""
     fields = dict(fields)
     names, meta = list(fields["names"]), dict(fields["meta"])
     count = fields.pop("actions") or 0

@@ -1,4 +1,4 @@
-"""What a reader gives: a recording per file or episode, a signal per sensor, as logged."""
+"""Results of readers: a recording per file or episode, a signal per sensor, as logged."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ KINDS = ("", "angle", "quaternion")
 class Signal:
     """The values of one sensor, topic or table, as they were logged.
 
-    Its arrays are handed over: they become those of trajectories, and read-only.
+    Its arrays become those of trajectories, and read-only.
 
     Args:
         name: of the topic or table. Channels are called `name.channel` where several signals are
             merged, and `channel` where there is only one.
         stamps: (n,) nanoseconds on the recording's clock, int64, in the order of the log.
         values: (n, channels) float64, NaN = missing. A view of columns that lie one after the
-            other in memory (order F) is welcome: nothing is copied without need.
+            other in memory (order F) avoids a copy.
         channels: a name per channel.
         units: a unit per channel, such as `rad/s`; by default empty.
         kinds: per channel `""`, `angle` (rad, or degrees where its unit is `deg`) or `quaternion`
-            (four channels in a row are one quaternion); by default `""`. A reader sets what it
-            knows.
+            (four channels in a row are one quaternion); by default `""`. A reader sets the kinds
+            that it knows.
         roles: one of `ROLES` per channel; by default `state`. A channel with the role `action`
-            keeps its last value until the next one was logged.
+            keeps its last value until the next logged one.
 
     Raises:
         InputError: shapes, types or numbers of names disagree.
@@ -91,11 +91,11 @@ class Recording:
     Args:
         signals: what was logged; a signal may be empty.
         label: of the episode, where the file has one.
-        origin: where it came from, for messages and reports.
-        time_unit: the unit that the file itself counts in, for reports: `s`, `ms`, `us`, `ns` or
+        origin: source, for messages and reports.
+        time_unit: unit of times in the file, for reports: `s`, `ms`, `us`, `ns` or
             `100ns`.
-        notes: what the reader had to assume or to leave out, such as "stamps are row number / fps".
-        clock_zero: the file's clock at stamp 0, in `time_unit`, where the stamps do not
+        notes: assumptions and omissions of the reader, such as "stamps are row number / fps".
+        clock_zero: the file's clock at stamp 0, in `time_unit`, if the stamps do not
             count from the clock's own zero because that would exceed an int64.
 
     Raises:

@@ -19,7 +19,7 @@ from offbeat.data.robots import Control, Robot, channels_of, controls_of, load_m
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import DivergenceError, InputError, require
 
-_ROWS_PER_CHUNK = 32_768  # about a quarter of a second: the progress bar moves, threads stay busy
+_ROWS_PER_CHUNK = 32_768  # about 0.25 s: updates the progress bar, and keeps threads busy
 
 
 def simulate(
@@ -33,16 +33,16 @@ def simulate(
     threads: int | None = None,
     progress: bool = True,
 ) -> Dataset:
-    """Simulates a robot: without controls, it falls, bounces and comes to rest.
+    """Simulates trajectories of a robot, without controls by default.
 
     The first row of a trajectory is its initial state, and one row follows per physics step. With
-    controls, each row also has those that act from it to the next row, as channels with the role
-    `action`. The same arguments give the same bytes whatever `threads` is, and the first
+    controls, each row also has those applied from it to the next row, as channels with the role
+    `action`. The same arguments give the same bytes for any `threads`, and the first
     trajectories of a larger data set are those of a smaller one.
 
     Args:
         robot: name of the robot, one of `offbeat.data.robots.ROBOTS`; an MJCF file; or a `Robot`.
-        n_trajectories: how many to simulate; with `initial_states`, their number counts.
+        n_trajectories: number of trajectories; ignored with `initial_states`.
         rows: rows per trajectory, at least 2.
         controls: a function of the time (s) and the (nq + nv,) positions and velocities that gives
             (nu,) controls, or recorded ones, (rows, nu) for all trajectories or
@@ -50,12 +50,12 @@ def simulate(
             thread.
         seed: seed of the initial states, 0 to 2**32 - 1.
         initial_states: (n, nq + nv) positions, then velocities, instead of the robot's own draw.
-        threads: how many to use; by default one per core that this process may run on.
+        threads: number of threads; by default one per available core.
         progress: show a progress bar on standard error.
 
     Returns:
         Trajectories with one channel per position and velocity; `meta` holds the robot, the seed
-        (None with given states), the time step and the versions of what made the data.
+        (None with given states), the time step and the versions of the software.
 
     Raises:
         InputError: the robot is unknown, or an argument is out of bounds.
@@ -112,7 +112,7 @@ def simulate(
 
 def available_cores() -> int:
     """Number of cores that this process may run on."""
-    if sys.platform == "linux":  # where affinity and container limits hold
+    if sys.platform == "linux":  # affinity and container limits apply
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
@@ -149,8 +149,8 @@ def _roll_out(
     ):
         for start in range(0, len(states), chunk):
             part = slice(start, min(start + chunk, len(states)))
-            # After a warning the rollout repeats that row. One step more than needed lets the clock
-            # show it for warnings of the last row, too.
+            # After a warning the rollout repeats that row. One more step than needed makes this
+            # visible in the clock for warnings of the last row as well.
             acted = None if controls is None else controls[part]
             stepped, _ = pool.rollout(model, data, full[part], acted, nstep=rows)
             _check_stable(robot, stepped, start, warnings)
@@ -199,7 +199,7 @@ def _step(
 
 
 def _keep_unstable_states(mujoco: Any, model: Any) -> None:
-    """Turns off that an unstable state is replaced by the model's default state."""
+    """Disables the reset of an unstable state to the model's default state."""
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
 
 
@@ -236,7 +236,7 @@ def _check_stable(
 
 @contextmanager
 def _collected_warnings(mujoco: Any) -> Iterator[list[str]]:
-    """Collects MuJoCo's warnings, which else go to a log file in the working directory."""
+    """Collects MuJoCo's warnings, which otherwise go to a log file in the working directory."""
     before = mujoco.get_mju_user_warning()
     warnings: list[str] = []
     mujoco.set_mju_user_warning(warnings.append)

@@ -1,4 +1,4 @@
-"""The check that every file passes before it is read."""
+"""Checks of files before they are read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PICKLE_STARTS = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 
 
 def starts_with(path: Path, starts: bytes | tuple[bytes, ...]) -> bool:
-    """Whether a file begins with certain bytes; False where it cannot be read."""
+    """Whether a file starts with certain bytes; False if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(64).startswith(starts)
@@ -22,7 +22,7 @@ def starts_with(path: Path, starts: bytes | tuple[bytes, ...]) -> bool:
 
 
 def require_file(path: str | Path) -> Path:
-    """Returns the path of a file that is there, is not empty, and holds data of its own.
+    """Returns the path of a file that exists, is not empty, and contains data.
 
     Readers of folders call this for each file that they open.
 
@@ -55,7 +55,7 @@ def require_file(path: str | Path) -> Path:
 
 
 def require_source(path: str | Path) -> Path:
-    """As `require_file`, but a folder is fine, too, if anything is in it.
+    """As `require_file`, but also accepts a folder that is not empty.
 
     Raises:
         FileFormatError: as `require_file`, or the folder is empty or can't be read.

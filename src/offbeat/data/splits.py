@@ -1,4 +1,4 @@
-"""Training, validation and test part of a data set: windows, masks and splits."""
+"""Splits of data sets into training, validation and test part."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def split(
 def split_in_time(
     dataset: Dataset, fractions: Sequence[float] = (0.7, 0.15, 0.15)
 ) -> tuple[Dataset, ...]:
-    """Splits by time: the first rows are the first part, the rows after them the second, and so on.
+    """Splits by time: the first rows are the first part, the next rows the second, and so on.
 
     Several trajectories count as one recording, one after the other; the one in which a part ends
-    is cut there. A single row that is left over is dropped.
+    is split there. A part of a trajectory with a single row is dropped.
 
     Args:
         dataset: a recording, its trajectories in the order of time.
@@ -90,7 +90,7 @@ def apply_split(dataset: Dataset, config: SplitConfig) -> tuple[Dataset, Dataset
 
     Args:
         dataset: as recorded.
-        config: what to do.
+        config: the options.
 
     Returns:
         Training, validation and test part.
@@ -160,7 +160,7 @@ def save_split(path: str | Path, config: SplitConfig, dataset: Dataset) -> None:
 
 
 def load_split(path: str | Path, dataset: Dataset) -> tuple[Dataset, Dataset, Dataset] | None:
-    """Splits a data set as it was split before.
+    """Repeats a saved split.
 
     Args:
         path: JSON file that `save_split` wrote; where it is missing, `parts.json` beside it, which

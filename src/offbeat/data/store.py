@@ -1,4 +1,4 @@
-"""Data sets on disk: one Parquet file, one row per time, our schema in its metadata.
+"""Data sets on disk: a Parquet file with one row per time, and a schema in its metadata.
 
 The columns are `trajectory` (int32, counted from 0), `time` (float64, seconds), one float64 column
 per channel (NaN = not known), and `name|observed` (bool) for the channels in which some known value
@@ -23,17 +23,17 @@ from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError
 from offbeat.files import atomic_path
 
-_ROWS_PER_GROUP = 262_144  # bounds the memory beside the data set itself while it is written
+_ROWS_PER_GROUP = 262_144  # bounds the memory used while a data set is written
 
 
 def save(dataset: Dataset, path: str | Path) -> None:
-    """Writes a data set; `load` gives it back to the last bit.
+    """Writes a data set; `load` restores it exactly.
 
-    The file is written under a temporary name and renamed, so a stop in the middle loses nothing.
+    The file is written atomically.
 
     Args:
         dataset: the data set; its `meta` must be JSON-like.
-        path: the file to write; what stood there is replaced.
+        path: the file to write; an existing file is replaced.
 
     Raises:
         InputError: a channel has the name of another column, or `meta` is not JSON-like.
@@ -71,8 +71,8 @@ def load(path: str | Path) -> Dataset:
         The data set; its trajectories share the memory of one array.
 
     Raises:
-        FileFormatError: there is no such file, or it is truncated, damaged, not a data set of ours,
-            or of a later version of the schema.
+        FileFormatError: there is no such file, or it is truncated, damaged, not a data set of
+            Offbeat, or of a later version of the schema.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -93,7 +93,7 @@ def load(path: str | Path) -> Dataset:
 
 
 def holds_data_set(path: str | Path) -> bool:
-    """Whether a file is Parquet with our schema in its metadata; never raises for its content."""
+    """Whether a file is Parquet with Offbeat's schema; never raises for invalid content."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,8 +1,8 @@
 """Input transforms: angles without wraps, quaternions without sign flips, for batches and streams.
 
-A model is trained on angles that have been unwrapped and on quaternions that are continuous in
-sign. `Transforms` records which channels these are; it is saved with the model, applied to
-everything the model is given, and undone on what it predicts.
+A model is trained on unwrapped angles and on quaternions that are continuous in
+sign. `Transforms` records these channels; it is saved with the model, applied to
+all inputs of the model, and undone on its predictions.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ Values = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 META_KEY = "transforms"
-"""Key of `Dataset.meta` that lists the transforms a data set has been through."""
+"""Key of `Dataset.meta` with the transforms that were applied to a data set."""
 
 _DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}")
-_UNIT_LENGTH = 1e-12  # a quaternion that is nearer to length 1 than this is not divided again
+_UNIT_LENGTH = 1e-12  # a quaternion this close to length 1 is not normalised again
 NO_LENGTH = 1e-6
-"""A quaternion that is shorter than this has no direction."""
+"""A shorter quaternion has no direction."""
 
 
 def is_angle_unit(unit: str) -> bool:
@@ -82,11 +82,11 @@ class Angle:
 
 @dataclass(frozen=True)
 class Transforms:
-    """What is done to the channels of a data set before a model sees them.
+    """Transforms of the channels of a data set before they are given to a model.
 
-    Each angle is unwrapped: a step of more than half a turn between two observations is taken for
+    Each angle is unwrapped: a step of more than half a turn between two observations is treated as
     a wrap. Each quaternion is scaled to length 1, with the sign nearer to the observation before.
-    Only what was observed earlier decides, so a stream and a batch agree.
+    The result depends only on earlier observations, so a stream and a batch agree.
 
     Attributes:
         angles: the angle channels, by name.
@@ -113,12 +113,12 @@ class Transforms:
 
     @classmethod
     def identity(cls) -> Transforms:
-        """Changes nothing."""
+        """Transforms that change nothing."""
         return cls()
 
     @classmethod
     def of(cls, dataset: Dataset) -> Transforms:
-        """The transforms that a data set has been through: those of `apply`, or of its reader."""
+        """The transforms that were applied to a data set, by `apply` or its reader."""
         if META_KEY in dataset.meta:
             found = cls.from_dict(dataset.meta[META_KEY])
         else:
@@ -135,11 +135,11 @@ class Transforms:
 
     @property
     def is_identity(self) -> bool:
-        """Whether there is nothing to do."""
+        """Whether the transforms change nothing."""
         return not self.angles and not self.quaternions
 
     def restricted(self, names: Sequence[str]) -> Transforms:
-        """The transforms of these channels alone."""
+        """The transforms of these channels only."""
         return Transforms(
             {name: angle for name, angle in self.angles.items() if name in names},
             tuple(four for four in self.quaternions if set(four) <= set(names)),
@@ -171,7 +171,7 @@ class Transforms:
             ) from None
 
     def apply(self, dataset: Dataset) -> Dataset:
-        """Transforms a data set; what it has been through already is not done again.
+        """Transforms a data set, except for transforms that were already applied.
 
         Values that are known and not observed follow the observations around them, and change
         nothing else.
@@ -180,8 +180,8 @@ class Transforms:
             dataset: with any of the channels, in original units.
 
         Returns:
-            The data set, with the transforms listed in its `meta`; the same object where nothing
-            is to be done.
+            The data set, with the transforms listed in its `meta`; the same object if nothing
+            changes.
         """
         done = Transforms.of(dataset)
         todo = self._without(done).restricted(dataset.names)
@@ -195,15 +195,15 @@ class Transforms:
         )
 
     def undo(self, predicted: Dataset, given: Dataset) -> Dataset:
-        """Takes predictions back to the convention of the data that they were made from.
+        """Converts predictions back to the convention of the observed data.
 
-        Angles come back with the turns of the last observation before them, and within the range
-        of the sensor as long as all observations before them were. Quaternions come back with
+        Angles get the turns of the last observation before them, and are within the range
+        of the sensor if all observations before them were. Quaternions have
         length 1.
 
         Args:
             predicted: one trajectory of predictions per trajectory given.
-            given: what was observed, as it was before `apply`.
+            given: the observed data before `apply`.
         """
         if self.is_identity:
             return predicted
@@ -243,7 +243,7 @@ def _transformed(trajectory: Trajectory, transforms: Transforms) -> Trajectory:
 
 
 def _turns(sent: Values, seen: Mask, period: float) -> Values:
-    """(n,) turns to take out of each known value of an angle.
+    """(n,) turns to remove from each known value of an angle.
 
     Observed values follow each other. The others follow the last observation before them through
     the values between, or lead to the first one.
@@ -258,12 +258,12 @@ def _turns(sent: Values, seen: Mask, period: float) -> Values:
 
 
 def _counted(sent: Values, period: float) -> Values:
-    """(n,) turns made since the first value, each step being less than half a turn."""
+    """(n,) turns since the first value, assuming steps of less than half a turn."""
     return np.append(0.0, np.cumsum(np.round(np.diff(sent) / period)))[: len(sent)]
 
 
 def _continuous(four: Values, observed: Mask) -> tuple[Values, Mask]:
-    """(n, 4) a quaternion without sign flips, of length 1, and what of it is observed."""
+    """(n, 4) a quaternion without sign flips, of length 1, and its observed mask."""
     gone = observed.all(axis=1) & (lengths(four) <= NO_LENGTH)
     four = np.where(gone[:, None], np.nan, four)
     observed = observed & ~gone[:, None]
@@ -303,13 +303,13 @@ def _wrapped_back(
 
 
 def in_range(value: Any, lowest: Any, period: Any) -> Any:
-    """Whether a value lies within a turn from `lowest`; rounding to float32 does not matter."""
+    """Whether a value is within a turn from `lowest`, up to rounding in float32."""
     slack = 1e-6 * period
     return (value >= lowest - slack) & (value <= lowest + period + slack)
 
 
 def into_range(value: Values, lowest: Any, period: Any) -> Values:
-    """Values moved by whole turns into [lowest, lowest + period); those inside stay bit for bit."""
+    """Values moved by whole turns into [lowest, lowest + period); those inside do not change."""
     return np.asarray(value - period * np.floor((value - lowest) / period))
 
 
@@ -319,7 +319,7 @@ def lengths(four: Values) -> Values:
 
 
 def unit_quaternions(four: Values) -> Values:
-    """(n, 4) scaled to length 1; what has length 1 or none stays bit for bit."""
+    """(n, 4) scaled to length 1; those of length 1 or 0 do not change."""
     length = lengths(four)
     keep = (np.abs(length - 1) <= _UNIT_LENGTH) | ~(length > NO_LENGTH)
     return four / np.where(keep, 1.0, length)[:, None]

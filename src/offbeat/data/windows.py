@@ -28,23 +28,23 @@ def windows(
     """Cuts windows of consecutive rows out of each trajectory.
 
     - `one` window per trajectory, its start drawn uniformly.
-    - `consecutive` windows, one after the other. What is left at the end joins the last window if
-      it is shorter than half a window, and is a window of its own otherwise.
+    - `consecutive` windows, one after the other. The remainder at the end joins the last window if
+      it is shorter than half a window, and is a separate window otherwise.
     - `random` windows, the start of each drawn uniformly; they may overlap.
 
-    A trajectory shorter than a window is an error for `one`, and a window for the others.
+    A trajectory shorter than a window raises an error for `one`, and is a window for the others.
 
     Args:
         dataset: trajectories to cut.
         length: rows of a window; this or `seconds`.
-        seconds: s, length of a window: its rows lie within that time from its first row on.
+        seconds: s, length of a window: its rows are within that time from its first row on.
         cut: `one`, `consecutive` or `random`.
-        count: windows that `random` draws from each trajectory; by default as many as are as long
-            as the trajectory together.
-        seed: of the draws.
+        count: windows that `random` draws from each trajectory; by default as many as have the
+            length of the trajectory together.
+        seed: of the random starts.
 
     Returns:
-        The windows, in the order of their trajectories; times stay as they are.
+        The windows, in the order of their trajectories, with unchanged times.
 
     Raises:
         InputError: a length is not above 0, both or none are given, or a trajectory is too short.
@@ -62,7 +62,7 @@ def owned_windows(
     count: int | None,
     seed: int,
 ) -> tuple[Dataset, NDArray[np.int64]]:
-    """As `windows`, each trajectory cut in its own way; and which one each window is cut from.
+    """As `windows`, with a cut per trajectory; also returns the trajectory of each window.
 
     Args:
         dataset: trajectories to cut.
@@ -70,7 +70,7 @@ def owned_windows(
         seconds: as of `windows`.
         cuts: one per trajectory.
         count: as of `windows`.
-        seed: of the draws.
+        seed: of the random starts.
 
     Returns:
         The windows, and (windows,) the position of the trajectory that each is a part of.
@@ -99,7 +99,7 @@ class _Span:
     seconds: float
 
     def ends(self, times: NDArray[np.float64]) -> NDArray[np.int64]:
-        """(rows,) where a window that starts at each row stops; may lie beyond the end."""
+        """(rows,) the end of a window that starts at each row; may be beyond the last row."""
         if self.rows is not None:
             return np.arange(len(times)) + self.rows
         # With a tolerance: a window of 1 s has 200 rows on a grid of 5 ms.

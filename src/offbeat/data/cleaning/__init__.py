@@ -1,1 +1,1 @@
-"""Cleaning: clocks, duplicates, outages, repeated values, and the log of what was done."""
+"""Cleaning: clocks, duplicates, outages, repeated values, and the cleaning log."""

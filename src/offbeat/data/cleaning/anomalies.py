@@ -15,7 +15,7 @@ Values = NDArray[np.float64]
 _DAY = 86_400 * 10**9
 _SECOND = 10**9
 _FEW_STEPS = 20
-_LATE_ROWS = 10  # after so many rows a step back is no late row
+_LATE_ROWS = 10  # a step back that lasts longer than this is not a late row
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +23,8 @@ class Disorder:
     """Anomalies of the order of time stamps.
 
     Attributes:
-        late: stamps of the rows that are lower than one before them.
-        duplicates: stamps of the rows that have that of another row.
+        late: stamps that are lower than an earlier one.
+        duplicates: stamps that occur in several rows.
     """
 
     late: Stamps
@@ -40,7 +40,7 @@ _IN_ORDER = Disorder(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 
 def disorder(stamps: Stamps) -> Disorder:
-    """Finds rows that are late and stamps that repeat."""
+    """Finds late rows and repeated stamps."""
     if (np.diff(stamps) > 0).all():
         return _IN_ORDER
     ordered = np.sort(stamps)
@@ -50,11 +50,11 @@ def disorder(stamps: Stamps) -> Disorder:
 
 
 def clock_jumps(stamps: Stamps) -> Stamps:
-    """Rows at which the clock was set: back for good, or forward by more than a day (and 20 steps).
+    """Finds rows at which the clock was set back, or forward by more than a day (and 20 steps).
 
     A step back counts if it is longer than a second and than 20 median steps, and if none of the
-    10 rows that follow reaches the old clock again; else the row is late. Where more than 1 row in
-    100 steps back so, the rows are out of order, and no clock was set.
+    next 10 rows reaches the old clock again; otherwise the row is late. If more than 1 row in
+    100 steps back in this way, the rows are out of order, and no clock was set.
     """
     steps = np.diff(stamps)
     if not len(steps) or ((steps >= 0) & (steps <= _DAY)).all():
@@ -70,7 +70,7 @@ def clock_jumps(stamps: Stamps) -> Stamps:
     back = back[stays & (back < len(stamps) - 1)]
     far = max(_DAY, 20 * usual)
     ahead = np.flatnonzero(steps > far) + 1
-    # A forward step that ends a late stamp is none.
+    # A forward step from a late stamp does not count.
     reached = np.maximum.accumulate(stamps)
     ahead = ahead[stamps[ahead] - reached[ahead - 1] > far]
     return np.union1d(back, ahead)
@@ -79,7 +79,7 @@ def clock_jumps(stamps: Stamps) -> Stamps:
 def in_order(
     stamps: Stamps, values: Values, choice: Literal["sort", "drop", "refuse"]
 ) -> tuple[Stamps, Values]:
-    """Stamps that do not decrease, with their values; `refuse` is up to the caller."""
+    """Sorts or drops late rows; `refuse` is left to the caller."""
     if (np.diff(stamps) >= 0).all():
         return stamps, values
     if choice == "drop":
@@ -92,7 +92,7 @@ def in_order(
 def one_row_per_stamp(
     stamps: Stamps, values: Values, choice: Literal["last", "first", "mean", "refuse"]
 ) -> tuple[Stamps, Values]:
-    """Merges rows of one stamp, channel by channel, over the values that are known."""
+    """Merges the rows of each stamp, per channel, over known values."""
     starts = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1) != 0)
     if len(starts) == len(stamps):
         return stamps, values
@@ -136,10 +136,10 @@ def union(signals: list[tuple[Stamps, Values, list[int]]], channels: int) -> tup
 
     Args:
         signals: stamps that increase strictly, values, and the channel of each column.
-        channels: their number in all.
+        channels: total number of channels.
 
     Returns:
-        (rows,) stamps and (rows, channels) values; the arrays of a lone signal are not copied.
+        (rows,) stamps and (rows, channels) values; the arrays of a single signal are not copied.
     """
     if len(signals) == 1:
         stamps, values, columns = signals[0]
@@ -159,9 +159,9 @@ def union(signals: list[tuple[Stamps, Values, list[int]]], channels: int) -> tup
 
 
 def longest_allowed(stamps: Stamps, max_gap_s: float | Literal["auto"] | None) -> int | None:
-    """Nanoseconds above which a step is an outage; None where none is.
+    """Nanoseconds above which a step is an outage; None for no limit.
 
-    `auto` is 20 times the 95th percentile of the steps, the longest one left out, and at least 1 s;
+    `auto` is 20 times the 95th percentile of the steps without the longest one, and at least 1 s;
     with fewer than 20 steps there is no outage.
     """
     if max_gap_s is None:

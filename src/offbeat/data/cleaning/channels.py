@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 Values = NDArray[np.float64]
 
 REPEATED_FRACTION = 0.5
-"""Least fraction of values that equal the one before, for a channel to count as repeated."""
+"""Minimum fraction of values that equal the previous one, for a channel with repeated values."""
 
 _FEWEST_RUNS = 10
-_BLOCK = 1 << 14  # rows that stay in cache while they are looked at
+_BLOCK = 1 << 14  # rows that fit in the cache
 _QUATERNION = re.compile(r"(.*?)(?:^|[._\s\-/]|(?<=q)|(?<=quat)|(?<=quaternion))([wxyz])")
 _ROTATION = re.compile(r"q$|quat|orient|rotation|attitude|(^|[._\s\-/])q", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Repeats:
-    """How a recording at a higher rate repeats the values of a slower sensor.
+    """The repetition of a slower sensor's values by a faster recording.
 
     Attributes:
         fraction: of its known values that equal the one before.
@@ -34,11 +34,12 @@ class Repeats:
 
 
 def find_repeats(columns: Sequence[Values]) -> Repeats | None:
-    """Finds out whether a channel repeats the values of a slower sensor.
+    """Finds whether a channel repeats the values of a slower sensor.
 
-    It does where at least half of its known values equal the one before, in 10 runs of equal values
-    or more whose median length is 2 or more. A channel that rests now and then, and else changes at
-    every row, has mostly runs of one value and does not count; a constant has no run that ends.
+    It does if at least half of its known values equal the previous one, in 10 runs of equal values
+    or more whose median length is 2 or more. A channel that is constant at times and otherwise
+    changes at every row has mostly runs of one value and does not count, nor does a constant
+    channel.
 
     Args:
         columns: (rows,) its values in each episode, NaN = missing.
@@ -54,7 +55,7 @@ def find_repeats(columns: Sequence[Values]) -> Repeats | None:
     for column in columns:
         if len(column):
             changes = np.flatnonzero(column[1:] != column[:-1]) + 1
-            lengths.append(np.diff(changes, prepend=0))  # not the last run, which may go on
+            lengths.append(np.diff(changes, prepend=0))  # not the last run, which may be longer
     runs = np.concatenate(lengths)
     if len(runs) < _FEWEST_RUNS:
         return None
@@ -63,9 +64,9 @@ def find_repeats(columns: Sequence[Values]) -> Repeats | None:
 
 
 def _changes_mostly(columns: Sequence[Values]) -> bool:
-    """Whether some of the rows show that too few of all can equal the one before.
+    """Whether a subset of the rows rules out that enough values equal the previous one.
 
-    It is a fast test: two consecutive known values that differ are a change.
+    This is a fast test: two consecutive known values that differ are a change.
     """
     enough = (1 - REPEATED_FRACTION) * sum(len(column) - 1 for column in columns if len(column))
     changes = 0
@@ -85,7 +86,7 @@ def _known(column: Values) -> Values:
 
 
 def new_values(column: Values, rows_per_value: int) -> NDArray[np.bool_]:
-    """Where a slower sensor gave a new value: at each change, and at its own rate while it rests.
+    """Marks new values of a slower sensor: each change, and one per period while it is constant.
 
     Args:
         column: (n,) NaN = missing.
@@ -120,11 +121,11 @@ def unwrap(column: Values, period: float) -> int:
 
 @dataclass(frozen=True)
 class QuaternionChanges:
-    """What was done to the rows of a quaternion.
+    """Counts of changes to the rows of a quaternion.
 
     Attributes:
         flipped: rows whose sign was changed to that of the row before.
-        renormalised: rows whose length was off 1 by more than 0.001.
+        renormalised: rows whose length differed from 1 by more than 0.001.
         dropped: rows of length 0, or with one to three of the four values missing; all are NaN now.
     """
 
@@ -155,7 +156,7 @@ def make_continuous(four: Values) -> QuaternionChanges:
 
 
 def find_quaternions(names: Sequence[str], columns: Iterable[Values]) -> list[int]:
-    """First columns of four in a row that are a quaternion by their names and their length.
+    """First columns of quaternions, which are found by their names and lengths.
 
     Names end in w, x, y, z or x, y, z, w after one stem that names a rotation (`qx`, `q_w`,
     `orientation.z`); three rows in four, where all are known, have a length within 0.05 of 1.

@@ -1,7 +1,7 @@
-"""Clocks of logs: units of time, stated or found, and integer nanoseconds.
+"""Clocks of logs: units of time, given or detected, and integer nanoseconds.
 
 A clock that counts from 1970 in float64 seconds has steps of 0.24 us, in float32 of 128 s. So
-stamps are kept as integers until the start is taken off, and are seconds only then.
+stamps are integers until the start is subtracted, and are converted to seconds afterwards.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _UNIT_OF = {spelling: unit for unit, names in _SPELLINGS.items() for spelling in
 
 _STEMS = ("time", "t", "timestamp", "stamp", "clock")
 TIME_NAMES = (*_STEMS, *(f"{stem}_{unit}" for stem in _STEMS for unit in NANOSECONDS_PER))
-"""Names, in any case, that make a column the time; the first of them that a file has. Those with a
-unit say it; so does a unit in brackets, as in `t [ns]` and `Time (ms)`."""
+"""Names of time columns, in any case; the first one in a file is used. Names with a
+unit give the unit, as do units in brackets, as in `t [ns]` and `Time (ms)`."""
 
 _BRACKETS = re.compile(r"(.*?)\s+(?:\[([^\[\]]*)\]|\(([^()]*)\))")
 _FIRST_YEAR, _LAST_YEAR = 946_684_800, 4_102_444_800  # 2000 and 2100, in seconds since 1970
-_EPOCHS = {  # units in which a clock can count, and seconds from its zero to 1970
+_EPOCHS = {  # units of clocks, and seconds from the clock's zero to 1970
     "seconds since 1970": ("s", 0),
     "milliseconds since 1970": ("ms", 0),
     "microseconds since 1970": ("us", 0),
@@ -42,7 +42,7 @@ _EPOCHS = {  # units in which a clock can count, and seconds from its zero to 19
     "ticks of 100 ns since 1601": ("100ns", 11_644_473_600),
     "ticks of 100 ns since the year 1": ("100ns", 62_135_596_800),
 }
-_SLOWEST_S = 10.0  # a median step that is longer in seconds is taken for another unit
+_SLOWEST_S = 10.0  # if the median step in seconds is longer, another unit is assumed
 _TYPICAL_HZ = 100.0
 
 
@@ -55,14 +55,14 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def time_unit_in(name: str) -> str | None:
-    """The unit that the name of a time column says (`time_ms`, `t [ns]`), or None."""
+    """The unit in the name of a time column (`time_ms`, `t [ns]`), or None."""
     stem, unit = split_unit(name)
     text = unit.casefold() or stem.casefold().rpartition("_")[2]
     return _UNIT_OF.get(text) if unit or "_" in stem else None
 
 
 def time_column_of(names: list[str]) -> str | None:
-    """The column that is the time, by its name, or None."""
+    """The time column by its name, or None."""
     stems = {name: split_unit(name)[0].casefold().lstrip("#").strip() for name in names}
     for usual in TIME_NAMES:
         for name, stem in stems.items():
@@ -73,20 +73,20 @@ def time_column_of(names: list[str]) -> str | None:
 
 
 def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
-    """The unit of a clock by its numbers alone, and in words why.
+    """Detects the unit of a clock from its numbers.
 
-    A clock of today tells its unit by its size, for a number of 2000 to 2100 fits one unit alone:
+    A clock that shows a date from 2000 to 2100 is in the only unit that fits its numbers:
     seconds, milliseconds, microseconds, nanoseconds or ticks of 100 ns since 1970, or ticks since
-    1601 (Windows) or the year 1 (.NET). A clock that counts from elsewhere is in seconds, unless
-    its median step would then be longer than 10 s and three steps or more agree: then it is in the
-    unit, of `ms`, `us` and `ns`, that brings the rate nearest to 100 Hz.
+    1601 (Windows) or the year 1 (.NET). A clock with another origin is in seconds, unless
+    its median step would then be longer than 10 s and three steps or more agree. Then it is in the
+    unit, of `ms`, `us` and `ns`, with the rate closest to 100 Hz.
 
     Args:
         clock: (n,) numbers, in the order of the log.
 
     Returns:
-        The unit, and the reason for messages; the reason is empty where seconds are assumed for
-        want of a reason against them.
+        The unit, and the reason for messages; the reason is empty where seconds are assumed
+        by default.
     """
     numbers = np.asarray(clock, dtype=np.float64)
     numbers = numbers[np.isfinite(numbers)]
@@ -113,19 +113,19 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
 def state_time_unit(
     given: str | None, name: str, clock: ArrayLike, where: str
 ) -> tuple[str, tuple[str, ...]]:
-    """The unit of a clock: as given, else as its name says, else found by its numbers.
+    """The unit of a clock: as given, else from its name, else detected from its numbers.
 
     Args:
         given: the option `time_unit`, or None.
-        name: of the column, which may say a unit.
+        name: of the column, which may contain a unit.
         clock: (n,) some of its numbers.
         where: the file, for messages.
 
     Returns:
-        The unit, and notes: that it was found, and how to state it.
+        The unit, and notes on a detected unit.
 
     Raises:
-        InputError: the unit that is given is unknown, or the name says another one.
+        InputError: the given unit is unknown, or the name has another one.
     """
     named = time_unit_in(name)
     if given is not None:
@@ -147,9 +147,9 @@ def state_time_unit(
 def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], int]:
     """Integer nanoseconds of a clock, and what the clock shows at nanosecond 0.
 
-    Integers keep every bit. Floats are rounded to whole nanoseconds, after their whole part at the
-    start is taken off. The second result is 0, but where nanoseconds since the clock's own zero
-    exceed an int64, as ticks of 100 ns since 1601 do.
+    Integers are exact. Floats are rounded to whole nanoseconds, after their whole part at the
+    start is subtracted. The second result is 0 unless nanoseconds since the clock's own zero
+    exceed an int64, as for ticks of 100 ns since 1601.
 
     Args:
         clock: (n,) integers or floats, in `unit`.

@@ -14,25 +14,25 @@ from offbeat.errors import FileFormatError, InputError, one_of
 
 @dataclass(frozen=True)
 class Channels:
-    """The channels of all recordings together, in the order in which they were first met."""
+    """The channels of all recordings, in order of first appearance."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     roles: tuple[str, ...]
     columns: dict[tuple[str, str], int]  # by signal and channel
-    angles: dict[int, float]  # the full turn of each, in its unit
+    angles: dict[int, float]  # full turn of each, in its unit
     quaternions: tuple[tuple[int, ...], ...]
 
     @classmethod
     def of(cls, recordings: list[Recording], options: ReaderOptions) -> Channels:
-        """Collects the channels, and finds quaternions that no reader marked.
+        """Collects the channels, and finds quaternions that readers did not mark.
 
         Raises:
             FileFormatError: there is no channel, names repeat, or units disagree.
-            InputError: `channels`, `without` or `angles` names a channel that there is not.
+            InputError: `channels`, `without` or `angles` names an unknown channel.
         """
         if not recordings:
-            raise FileFormatError("there is nothing recorded to read; check the file")
+            raise FileFormatError("there are no recordings to read; check the file")
         columns: dict[tuple[str, str], int] = {}
         units: list[str] = []
         kinds: list[str] = []
@@ -98,7 +98,7 @@ class Channels:
         )
 
     def keep(self, signal: Signal) -> Signal | None:
-        """The signal with those of its channels that are kept, or None."""
+        """The signal with the channels that are kept, or None."""
         at = [i for i, name in enumerate(signal.channels) if (signal.name, name) in self.columns]
         if len(at) == len(signal.channels):
             return signal

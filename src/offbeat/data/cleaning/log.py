@@ -1,4 +1,4 @@
-"""The log of what was found and done while recordings were cleaned."""
+"""The cleaning log: what was found and changed in recordings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from offbeat.data.cleaning.options import ReaderOptions
 
 @dataclass
 class CleaningLog:
-    """Counts what is found and done while a data set is assembled.
+    """Counts findings and changes while a data set is assembled.
 
     Attributes:
         late: rows out of order, by signal.
@@ -26,12 +26,12 @@ class CleaningLog:
         repeated: of each channel with repeated values, their fraction and the rows per value.
         masked: repeated values that no longer count as measured.
         turns: jumps by a turn that were removed from each angle.
-        angles: of each channel that was unwrapped, its period and the range it was recorded in.
+        angles: of each channel that was unwrapped, its period and the range of its recorded values.
         quaternions: channels of each quaternion.
         flipped: rows of quaternions whose sign was changed.
         renormalised: rows of quaternions whose length was off 1 by more than 0.001.
-        dropped: rows of quaternions that were none.
-        notes: what readers had to assume or to leave out.
+        dropped: rows that were not quaternions.
+        notes: assumptions and omissions of readers.
     """
 
     late: Counter[str] = field(default_factory=Counter)
@@ -53,11 +53,11 @@ class CleaningLog:
     notes: dict[str, None] = field(default_factory=dict)
 
     def to_dict(self, options: ReaderOptions, episodes: list[dict[str, float]]) -> dict[str, Any]:
-        """Option and finding of each kind of anomaly, JSON-like.
+        """Option and findings of each kind of anomaly, JSON-like.
 
         Args:
             options: that were applied.
-            episodes: of the trajectories with anomalies, the number and what was found there.
+            episodes: trajectories with anomalies, by number, and the findings.
         """
         o = options
         limits = [min(self.limits_s), max(self.limits_s)] if self.limits_s else None
@@ -102,7 +102,7 @@ class CleaningLog:
 
 
 def upgraded(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The cleaning log of a data set that Offbeat 0.1.0 stored, in the terms of this version."""
+    """The cleaning log of a data set that Offbeat 0.1.0 stored, in the format of this version."""
     log = {
         key: {"option" if k == "policy" else k: v for k, v in entry.items()}
         if isinstance(entry, Mapping)
@@ -120,7 +120,7 @@ def upgraded(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def sentences(cleaning: Mapping[str, Any]) -> list[str]:
-    """A cleaning log as sentences, one for each kind of anomaly that was found."""
+    """A cleaning log as sentences, one per kind of anomaly found."""
     lines: list[str] = list(cleaning["notes"])
     order, duplicates, jumps = cleaning["order"], cleaning["duplicates"], cleaning["clock_jumps"]
     if order["late"]:
@@ -192,6 +192,6 @@ def _were(count: int) -> str:
 
 
 def listed(names: list[str], most: int = 6) -> str:
-    """Names for messages; of many, the first ones and the number of the others."""
+    """Names for messages; of many names, the first ones and the number of the rest."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

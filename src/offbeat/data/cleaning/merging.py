@@ -1,4 +1,4 @@
-"""From signals to episodes: rows ordered, signals merged on the union of stamps, outages cut."""
+"""Converts signals to episodes: orders rows, merges signals, splits at outages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from offbeat.errors import FileFormatError, InputError
 
 @dataclass
 class Episode:
-    """A part of a recording, its signals merged."""
+    """A part of a recording, with its signals merged."""
 
     stamps: NDArray[np.int64]
     values: NDArray[np.float64]
@@ -33,17 +33,17 @@ class Episode:
 
     @property
     def label(self) -> str:
-        """That of the recording, with the number of the part where it was split."""
+        """Label of the recording, with the number of the part if it was split."""
         return f"{self.recording.label}/{self.part}" if self.part else self.recording.label
 
     def own(self) -> NDArray[np.float64]:
-        """The values, which can be written to; copied first where others use them."""
+        """Returns writable values; copies them first if they are shared."""
         if not self.owned:
             self.values, self.owned = self.values.copy(order="F"), True
         return self.values
 
     def trajectory(self, channels: Channels, options: ReaderOptions) -> Trajectory:
-        """Seconds from integer nanoseconds, checked.
+        """Makes a checked trajectory with times in seconds.
 
         Raises:
             FileFormatError: a trajectory cannot be made: two times are equal in float64.
@@ -67,9 +67,9 @@ class Episode:
 def cut(
     recording: Recording, channels: Channels, options: ReaderOptions, log: CleaningLog
 ) -> list[Episode]:
-    """The episodes of a recording: its rows in order, its signals merged, split at outages."""
+    """Splits a recording into episodes: orders its rows, merges its signals, splits at outages."""
     for signal in recording.signals:
-        hand_over(signal.values)  # from here on, what is cleaned is copied first
+        hand_over(signal.values)  # cleaning copies the values first
     kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
     signals = [signal for signal in kept if signal is not None]
     if not signals:
@@ -116,7 +116,7 @@ def cut(
 def _anomalies_in(
     stamps: NDArray[np.int64], disorders: Iterable[anomalies.Disorder]
 ) -> dict[str, float]:
-    """How many rows between the first and the last stamp came late, or repeat one."""
+    """Number of rows between two stamps that are late, or repeat a stamp."""
     counts: dict[str, float] = {}
     for found in disorders:
         for name, at in (("late", found.late), ("duplicates", found.duplicates)):
@@ -129,7 +129,7 @@ def _anomalies_in(
 def _pieces(
     signals: list[Signal], recording: Recording, options: ReaderOptions, log: CleaningLog
 ) -> list[list[Signal]]:
-    """Signals cut where the clock was set, each piece with the parts that belong together."""
+    """Splits signals where the clock was set, and groups the parts."""
     cuts = [anomalies.clock_jumps(signal.stamps) for signal in signals]
     most = max(range(len(signals)), key=lambda i: len(cuts[i]))
     log.clock_jumps += len(cuts[most])
@@ -218,7 +218,7 @@ def _where(signal: Signal, recording: Recording) -> str:
 
 
 def _seconds(stamp: Any) -> str:
-    """A stamp in seconds, to the nanosecond."""
+    """A stamp in seconds, with nanosecond precision."""
     whole, rest = divmod(abs(int(stamp)), 10**9)
     sign = "-" if stamp < 0 else ""
     return f"{sign}{whole}.{rest:09d}".rstrip("0").rstrip(".")

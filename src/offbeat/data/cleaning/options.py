@@ -1,4 +1,4 @@
-"""How recordings are cleaned while they are read."""
+"""Options of the cleaning of recordings."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from offbeat.errors import InputError, one_of
 
 @dataclass(frozen=True)
 class ReaderOptions:
-    """How recordings are cleaned while they are read; each field is an option of `read`.
+    """Options of the cleaning of recordings; each field is an option of `read`.
 
-    With the defaults, no measured value is lost, and none is made up. `Dataset.meta["cleaning"]`
+    With the defaults, no measured value is removed or invented. `Dataset.meta["cleaning"]`
     counts what each option did.
 
     Attributes:
-        channels: names of the channels to keep, as a data set of all would call them, in this
+        channels: names of the channels to keep, as in a data set of all channels, in this
             order; None keeps all. Rows in which none of them was logged are not read.
         without: names of channels to leave out.
-        actions: names of channels to give the role `action`, beside those that the format marks.
-            An action holds until the next one was logged, and its values are not cleaned.
+        actions: names of channels to give the role `action`, in addition to those that the format
+            marks. An action applies until the next logged one, and its values are not cleaned.
         exogenous: names of channels to give the role `exogenous`.
         order: rows whose time stamp is lower than one before it: `sort` them, `drop` them, or
             `refuse` the file.
@@ -31,7 +31,7 @@ class ReaderOptions:
             `first` one logged, or their `mean`, or `refuse` the file.
         clock_jumps: where a clock was set back, or forward by more than a day, while it was logged:
             `split` into episodes, `join` as if rows were out of order, or `refuse` the file.
-        max_gap_s: s, a longer time without any row is an outage, and splits into episodes. `auto`
+        max_gap_s: s, a longer time without any row is an outage, where episodes are split. `auto`
             is 20 times the 95th percentile of the steps between rows, and at least 1 s; None never
             splits.
         min_rows: an episode that a split leaves with fewer rows than this is left out.
@@ -43,16 +43,16 @@ class ReaderOptions:
         angles: names of more channels that are angles, in radians, or in degrees where their unit
             is `deg`.
         quaternions: `continuous` gives each row the sign that is nearer to the row before (q and -q
-            are one rotation) and length 1, and counts one of length 0 as missing; `keep` leaves
-            them as they are.
-        infinite: an infinite value counts as `missing`, or `refuse` the file.
-        start: times count from the `first_row` of each episode, or are those of the recording's
+            are one rotation) and length 1, and treats one of length 0 as missing; `keep` does not
+            change them.
+        infinite: treat an infinite value as `missing`, or `refuse` the file.
+        start: times start at the `first_row` of each episode, or are those of the recording's
             own `clock`.
         resample_hz: rows at this rate instead of at the time stamps; each row has the last values
             since the row before it, and NaN where there was none. None does not resample.
 
     Raises:
-        InputError: a value is none of these.
+        InputError: a value is invalid.
     """
 
     channels: tuple[str, ...] | None = None

@@ -22,10 +22,10 @@ from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.registry import Registry
 
 FOLDER = "/"
-"""The suffix of a reader of folders; such a reader must have `recognises`."""
+"""The suffix for readers of folders, which must have `recognises`."""
 
 OPTIONS = tuple(field.name for field in fields(ReaderOptions))
-"""The options that every format has whose reader gives recordings."""
+"""Options of every format whose reader returns recordings."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Reader:
     Args:
         name: of the format.
         suffixes: file name suffixes, in lower case, each with its dot; `FOLDER` for folders.
-        function: reads a file, whose path is its one positional argument; its keyword arguments
-            are the options of the format. It gives recordings, which are cleaned as `ReaderOptions`
-            say, or a finished data set. It opens no file that `require_file` has not passed (`read`
-            calls that for the file itself).
-        recognises: looks into a file (or a folder, where `FOLDER` is among the suffixes) and says
-            whether it is of this format, for formats that share a suffix; it never raises. None
-            where the suffix is enough; such a reader gets what no other one recognises.
-        cleaning: whether `function` gives recordings.
+        function: reads a file; its positional argument is the path, its keyword arguments
+            are the options of the format. It returns recordings, which are cleaned by
+            `ReaderOptions`, or a finished data set. It calls `require_file` on each file that it
+            opens (`read` does so for the file itself).
+        recognises: inspects a file (or a folder, if `FOLDER` is among the suffixes) and returns
+            whether it has this format, for formats with a common suffix; it never raises. None
+            if the suffix is enough; such a reader gets files that no other one recognises.
+        cleaning: whether `function` returns recordings.
 
     Raises:
         InputError: a suffix is not lower case with a dot, or a reader of folders has no
@@ -67,7 +67,7 @@ class Reader:
 
     @property
     def own_options(self) -> list[str]:
-        """Names of the options of the format alone."""
+        """Names of the options of the format itself."""
         parameters = inspect.signature(self.function).parameters.values()
         return [p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY]
 
@@ -90,7 +90,7 @@ def register_reader(
     cleaning: bool = True,
     replace: bool = False,
 ) -> Reader:
-    """Adds a format to those that `read` reads.
+    """Registers a format for `read`.
 
     Args:
         name: of the format.
@@ -114,15 +114,15 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
         path: the file or folder.
         format: name of the reader; by default found by the file's suffix and content.
         **options: options of the format, such as `time_unit` of CSV, and the fields of
-            `ReaderOptions`, which every format has but our own.
+            `ReaderOptions`, for every format but Offbeat's own.
 
     Returns:
-        The data set. Its `meta["cleaning"]` says what was found and done, `meta["source"]` where it
-        came from. What a reader had to assume, such as a unit of time found by the numbers, is in
+        The data set. Its `meta["cleaning"]` records what was found and changed, `meta["source"]`
+        its source. Assumptions of a reader, such as a detected unit of time, are in
         `meta["cleaning"]["notes"]`, and is logged as a warning of the logger `offbeat`.
 
     Raises:
-        FileFormatError: the file is missing, of no known format, or not what its format asks for.
+        FileFormatError: the file is missing, of an unknown format, or invalid.
         InputError: the format or an option is unknown.
     """
     path = require_source(path)
@@ -148,7 +148,7 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
 
 
 def _renamed(options: dict[str, Any], reader: Reader) -> dict[str, Any]:
-    """Options in the names of this version, from those that runs of Offbeat 0.1.0 have saved."""
+    """Options saved by runs of Offbeat 0.1.0, with the names of this version."""
     options = dict(options)
     if "held" in options and "repeated" in reader.options:
         options.setdefault("repeated", options["held"])
@@ -162,7 +162,7 @@ def reader_of(path: Path) -> Reader:
     """The reader of a file or folder that exists, by its suffix and content.
 
     Raises:
-        FileFormatError: no reader is for it.
+        FileFormatError: no reader supports it.
     """
     suffix = FOLDER if path.is_dir() else path.suffix.lower()
     fitting = [reader for reader in READERS.values() if suffix in reader.suffixes]
@@ -183,7 +183,7 @@ def reader_of(path: Path) -> Reader:
             f"{path} has the unknown suffix {suffix!r}, expected one of: {', '.join(named)}; "
             "rename it, or name its format with format="
         )
-    # No reader recognises it: one that goes by the suffix alone gives the best message.
+    # No reader recognises it: one that needs only the suffix gives the best message.
     return next((reader for reader in fitting if reader.recognises is None), fitting[0])
 
 

@@ -1,4 +1,4 @@
-"""Columns of Arrow, gathered chunk by chunk: beside the result, one chunk is in memory."""
+"""Copies Arrow columns chunk by chunk, with one chunk in memory besides the result."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def gather(
     columns: Columns,
     capacity: int,
 ) -> Gathered:
-    """Copies the columns that are needed out of record batches, one batch at a time.
+    """Copies the needed columns from record batches, one batch at a time.
 
     Args:
         batches: `pyarrow.RecordBatch`es with the columns `columns.read`.
-        columns: what they are.
-        capacity: at least the number of rows; what is too much costs address space alone.
+        columns: description of the columns.
+        capacity: at least the number of rows; excess costs only address space.
 
     Raises:
         NullValueError: a time, label or key is missing.
-        FileFormatError: the time is of no type that counts.
+        FileFormatError: the type of the time column is not supported.
         OverflowError: a time of decimals exceeds an int64 of nanoseconds.
     """
-    # Columns lie one after the other, so that each is filled and read as one block.
+    # In column order, so that each column is filled and read as one block.
     values = np.empty((len(columns.channels), capacity))
     clocks: list[NDArray[Any]] = []
     labels = Coder() if columns.label else None
@@ -71,15 +71,16 @@ def gather_columns(
     *,
     widths: Mapping[str, int] = MappingProxyType({}),
 ) -> Gathered:
-    """Copies columns of a file that can be read one by one, chunk by chunk.
+    """Copies columns that can be read one by one, chunk by chunk.
 
-    That keeps less in memory than batches of all columns, and what is decoded stays in cache.
+    This uses less memory than batches of all columns, and decoded data stay in the cache.
 
     Args:
-        sources: each gives the Arrow arrays of a column, all of the same; a thread for each.
-        columns: what the columns are.
+        sources: functions that return the Arrow arrays of a column of the same file; one thread
+            each.
+        columns: description of the columns.
         rows: their length.
-        widths: how many channels a column of lists gives.
+        widths: number of channels of each column of lists.
 
     Raises:
         NullValueError, FileFormatError, OverflowError: as `gather`.
@@ -107,7 +108,7 @@ def gather_columns(
 
     with ThreadPoolExecutor(len(sources)) as pool:
         for _ in pool.map(fill, range(len(sources))):
-            pass  # raises what a thread raised
+            pass  # raises the errors of threads
     return Gathered(clock, coded[0], coded[1], values.T)
 
 

@@ -1,4 +1,4 @@
-"""Tables, whatever their file: which column is what, and from columns to recordings.
+"""Tables of any file format: the meaning of columns, and their conversion to recordings.
 
 A table is wide (a row per time, a column per channel) or long (a row per measured value: time,
 channel, value), and holds one recording or, by a column of labels, several.
@@ -19,25 +19,25 @@ from offbeat.data.recording import Recording, Signal
 from offbeat.errors import FileFormatError, one_of
 
 LABEL_NAMES = ("trajectory", "episode", "episode_index", "demo")
-"""Names, in any case, that make a column the label of the trajectory that a row belongs to."""
+"""Names of trajectory columns, in any case."""
 
 KEY_NAMES = ("channel", "variable", "signal", "sensor", "name", "key", "topic", "field")
 VALUE_NAMES = ("value", "val", "data", "reading")
-"""Names, in any case, of the two columns beside the time that make a table a long one."""
+"""Names of the two columns of long tables besides the time, in any case."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """What each column of a table is.
+    """The meaning of each column of a table.
 
     Attributes:
         time: the column of times.
         label: the column of labels, or None.
-        channels: the columns that are channels; in a long table the one of values.
-        names: of the channels, without the unit that a column's name may say.
+        channels: the columns of channels; in a long table, the column of values.
+        names: of the channels, without units.
         units: of the channels.
-        key: in a long table, the column that says which channel a value is of.
-        chosen: in a long table, the channels asked for, or None.
+        key: in a long table, the column with the channel of each value.
+        chosen: in a long table, the selected channels, or None.
     """
 
     time: str
@@ -62,11 +62,11 @@ class Columns:
         channel_column: str | None = None,
         value_column: str | None = None,
     ) -> Columns:
-        """Says what each column is: as asked for, else by its name.
+        """Determines the meaning of each column, from options or names.
 
         Raises:
             FileFormatError: there is no time or no channel.
-            InputError: an option names a column that there is not.
+            InputError: an option names an unknown column.
         """
         names = list(header)
         time = time_column_of(names) if time_column is None else _named(time_column, names, "time")
@@ -132,13 +132,13 @@ class Columns:
 
     @property
     def read(self) -> list[str]:
-        """The columns that are needed, each once."""
+        """The needed columns, each once."""
         wanted = [self.time, self.label, self.key, *self.channels]
         return list(dict.fromkeys(name for name in wanted if name is not None))
 
 
 def _named(name: str, columns: list[str], what: str) -> str:
-    """A column by its name, with or without the unit that it says."""
+    """A column by its name, with or without its unit."""
     if name in columns:
         return name
     short = {split_unit(column)[0]: column for column in reversed(columns)}
@@ -175,7 +175,7 @@ def _long_form(
 
 @dataclass(frozen=True, eq=False)
 class Coded:
-    """A column of texts: a number per row, and the texts that the numbers mean."""
+    """A column of texts: a code per row, and the text of each code."""
 
     codes: NDArray[np.int64]
     texts: list[str]
@@ -183,13 +183,13 @@ class Coded:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """The columns of a table that are needed.
+    """The needed columns of a table.
 
     Attributes:
         clock: (rows,) integers or floats.
-        labels: which recording each row belongs to, or None.
-        keys: in a long table, which channel each row is of, or None.
-        values: (rows, channels), column after column in memory.
+        labels: the recording of each row, or None.
+        keys: in a long table, the channel of each row, or None.
+        values: (rows, channels), in column order.
     """
 
     clock: NDArray[Any]
@@ -199,7 +199,7 @@ class Gathered:
 
 
 class Coder:
-    """Numbers the texts of a column that comes in chunks, in the order of their first rows."""
+    """Encodes the texts of a column in chunks, in the order of their first rows."""
 
     def __init__(self) -> None:
         self._of: dict[str, int] = {}
@@ -220,7 +220,7 @@ class Coder:
         self._codes.append(np.array(codes, dtype=np.int64))
 
     def done(self) -> Coded:
-        """All rows."""
+        """Returns the encoded column."""
         return Coded(np.concatenate([*self._codes, np.zeros(0, np.int64)]), list(self._of))
 
 
@@ -233,18 +233,18 @@ def recordings(
     *,
     shown: str = "",
 ) -> list[Recording]:
-    """One recording per label, or one in all, from the columns of a table.
+    """Makes one recording per label, or a single one, from the columns of a table.
 
     Args:
         path: for messages.
-        columns: what they are.
+        columns: description of the columns.
         unit: of the clock.
         notes: of the recordings.
         table: the columns.
-        shown: the unit that the file counts in, where the clock is in another one already.
+        shown: unit of the file, where the clock was converted already.
 
     Raises:
-        FileFormatError: a time is not finite, a channel that is asked for is in no row, or two
+        FileFormatError: a time is not finite, a selected channel is in no row, or two
             have one name.
     """
     for i, name in enumerate(columns.names):
@@ -297,7 +297,7 @@ def _by_key(
 
 
 def _groups(coded: Coded | None) -> list[tuple[str, Any]]:
-    """Texts in the order of their first rows, each with its rows, as a slice where they can be."""
+    """Texts in the order of their first rows, each with its rows, as a slice if possible."""
     if coded is None:
         return [("", slice(None))]
     codes = coded.codes
@@ -305,7 +305,7 @@ def _groups(coded: Coded | None) -> list[tuple[str, Any]]:
         return []
     starts = np.flatnonzero(np.diff(codes, prepend=-1))
     met = codes[starts]
-    if len(np.unique(met)) == len(met):  # one run each: nothing needs to be copied
+    if len(np.unique(met)) == len(met):  # one run each: no copy is needed
         ends = [*starts[1:], len(codes)]
         return [
             (coded.texts[code], slice(start, end))

@@ -6,7 +6,7 @@ under `mask`. Minari (minari.farama.org, "Dataset standards"): `episode_0/observ
 longer than `episode_0/actions`, nested where the space is a dictionary or a tuple; the environment
 as JSON in `metadata.json` beside the file, or in an attribute of it. Neither stores times.
 
-Only arrays of numbers are read: what would need unpickling is refused.
+Only arrays of numbers are read; pickled data are refused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from offbeat.errors import FileFormatError, InputError, one_of, require
 SUFFIXES = (".hdf5", ".h5", ".hdf")
 
 WIDEST = 1024
-"""Numbers per row from which on an array is taken for a picture or a map, and left out."""
+"""Arrays with at least this many numbers per row are treated as images or maps, and left out."""
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _EPISODE = re.compile(r"(?:demo|episode)_(\d+)")
@@ -38,7 +38,7 @@ _MAIN = ("data/main_data.hdf5", "main_data.hdf5")
 
 
 def recognises(path: Path) -> bool:
-    """Whether a file starts like HDF5, or a folder is a data set of Minari."""
+    """Whether a file has the signature of HDF5, or a folder is a data set of Minari."""
     if path.is_dir():
         return any((path / name).is_file() for name in _MAIN)
     return starts_with(path, _MAGIC)
@@ -58,11 +58,11 @@ def recordings(
     Args:
         path: the file, or the folder of a Minari data set.
         keys: the observations to read, such as `robot0_eef_pos`, or `achieved_goal` in Minari; by
-            default all that are numbers, but for pictures.
-        include_actions: whether the actions are read, too; their channels have the role `action`.
+            default all numeric ones except images.
+        include_actions: whether actions are read; their channels have the role `action`.
         mask: robomimic's name of a subset of the episodes, such as `train`.
-        rate_hz: rows per second. By default that of the environment where the file says it; else
-            rows are taken to be 1 s apart, and that is noted.
+        rate_hz: rows per second. By default that of the environment, if the file has it; else
+            rows are assumed to be 1 s apart, which is noted.
         time_unit: unit of an observation that is the time, where there is one.
 
     Yields:
@@ -110,7 +110,7 @@ def recordings(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The file, with whatever HDF5 raises over damage turned into one line."""
+    """Opens the file; converts errors of HDF5 to one line."""
     import h5py
 
     try:
@@ -257,7 +257,7 @@ def _episode(
 
 
 def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """The arrays below a group, by path; of an array, itself. Elements of a tuple are numbered."""
+    """The arrays below a group, or the array itself, by path. Tuple elements are numbered."""
     import h5py
 
     if isinstance(node, h5py.Dataset):
@@ -275,7 +275,7 @@ def _prefixes(path: str) -> Iterator[str]:
 
 
 def _refuse_objects(dataset: Any, path: Path) -> None:
-    """Raises for what would have to be unpickled: opaque bytes, and objects of PyTables."""
+    """Raises an error for pickled data: opaque bytes, and objects of PyTables."""
     kind = dataset.dtype
     if (kind.kind == "V" and kind.names is None) or "PSEUDOATOM" in dataset.attrs:
         raise FileFormatError(
@@ -285,7 +285,7 @@ def _refuse_objects(dataset: Any, path: Path) -> None:
 
 
 def _what(dataset: Any) -> str:
-    """The kind of an array that holds no numbers, for messages."""
+    """The kind of a non-numeric array, for messages."""
     import h5py
 
     if dataset.dtype.kind in "SU" or h5py.check_string_dtype(dataset.dtype) is not None:

@@ -5,8 +5,8 @@ features, the rate and the pattern of the files' names. Version 2 has a Parquet 
 `meta/episodes.jsonl`; version 3 packs episodes into files, and `meta/episodes/*/*.parquet` says
 which file each one is in.
 
-LeRobot itself writes row number / fps into `timestamp`. Where a data set brings stamps of its own,
-in `timestamp` or in another column, those are taken; else rows are on a grid, which is noted.
+LeRobot itself writes row number / fps into `timestamp`. Where a data set has measured stamps,
+in `timestamp` or in another column, those are used; else rows are on a grid, which is noted.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ def recordings(
 
     Args:
         path: the folder of the data set, its `meta/info.json`, or one Parquet file of its data,
-            whose episodes alone are then read.
+            of which only the episodes in it are read.
         episodes: numbers of the episodes to read; by default all.
         columns: features to read as channels, such as `observation.state`; by default all that
-            are numbers, but for actions, rewards and bookkeeping.
-        include_actions: whether the features `action` (or `actions`) and `action.*` are read, too;
+            are numbers, except actions, rewards and bookkeeping.
+        include_actions: whether the features `action` (or `actions`) and `action.*` are read;
             their channels have the role `action`.
-        time_column: column of the stamps; by default one that is named like a time and is no mere
+        time_column: column of the stamps; by default one that is named like a time and is not
             row number / fps, else row number / fps.
-        time_unit: unit of that column; by default what its name says, else found.
+        time_unit: unit of that column; by default from its name, else detected.
 
     Yields:
-        Recordings. Channels are named as `info.json` names them, after their feature where there
+        Recordings. Channels are named as in `info.json`, after their feature if there
         are several.
 
     Raises:
@@ -79,13 +79,15 @@ def recordings(
     path = Path(path)
     root = root_of(path)
     if root is None:
-        raise FileFormatError(f"{path} is no LeRobot data set, there is no meta/info.json above it")
+        raise FileFormatError(
+            f"{path} is not a LeRobot data set: there is no meta/info.json above it"
+        )
     info = Info.of(root)
     files = info.episode_files()
     if path.suffix == ".parquet":
         files = {n: at for n, at in files.items() if at.file == path.absolute()}
         if not files:
-            raise FileFormatError(f"{path} is named by no episode in {root / 'meta'}")
+            raise FileFormatError(f"{path} is not a file of any episode in {root / 'meta'}")
     if episodes is not None:
         episodes = (episodes,) if isinstance(episodes, int) else episodes
         for number in episodes:
@@ -106,7 +108,7 @@ def recordings(
 
 
 class _Reading:
-    """Reads episodes one after the other; holds one file at a time."""
+    """Reads episodes in order, with one file in memory at a time."""
 
     def __init__(
         self,
@@ -126,7 +128,7 @@ class _Reading:
         if time_column is not None:
             one_of("time_column", time_column, info.features)
             self.clocks = [time_column]
-        else:  # stamps of their own come before LeRobot's
+        else:  # measured stamps take precedence over LeRobot's
             named = [f.name for f in info.features.values() if f.is_time]
             self.clocks = sorted(named, key=lambda name: name == "timestamp")
         self.path: Path | None = None
@@ -185,7 +187,7 @@ class _Reading:
                     self.time_unit, name.rpartition(".")[2], clock, str(file)
                 )
             stamps, zero = to_nanoseconds(clock, unit)
-            # LeRobot's own are float32: within a microsecond, or a millionth of them, is the grid.
+            # LeRobot's stamps are float32: differences of 1 us, or 1e-6 relative, are on the grid.
             near = 1_000 + grid // 1_000_000
             if self.given is None and (np.abs(stamps - stamps[:1] - grid) <= near).all():
                 continue
@@ -194,7 +196,7 @@ class _Reading:
 
 
 def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:
-    """A column of one number per row, in its own type, so that an integer clock keeps its bits."""
+    """A column of one number per row, in its own type, so that an integer clock stays exact."""
     import pyarrow as pa
 
     column = table.column(name).combine_chunks()
@@ -211,7 +213,7 @@ def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:
 
 
 def _matrix(table: Any, features: list[Feature], file: Path) -> NDArray[np.float64]:
-    """(rows, numbers) the columns of some features, side by side."""
+    """(rows, numbers) the columns of some features."""
     values = np.empty((table.num_rows, sum(f.width for f in features)), order="F")
     first = 0
     for feature in features:
@@ -222,7 +224,7 @@ def _matrix(table: Any, features: list[Feature], file: Path) -> NDArray[np.float
 
 
 def _column(table: Any, name: str, width: int, file: Path) -> NDArray[np.float64]:
-    """(rows, width) a column of numbers or of lists of them, NaN where there is none."""
+    """(rows, width) a column of numbers or of lists of numbers, NaN for null."""
     import pyarrow as pa
 
     column = table.column(name).combine_chunks()

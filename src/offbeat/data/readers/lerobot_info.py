@@ -17,7 +17,7 @@ from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of
 
 WIDEST = 1024
-"""Numbers per row from which on a feature is taken for a picture or a cloud, and left out."""
+"""Features with at least this many numbers per row are treated as images and left out."""
 
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _BESIDE = ("next.", "action", "annotation.", "complementary_info", "task", "subtask", "language")
@@ -26,7 +26,7 @@ _NUMBERS = re.compile(r"(u?int|float|bool)\d*")
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature as `info.json` describes it."""
+    """A feature of `info.json`."""
 
     name: str
     dtype: str
@@ -40,12 +40,12 @@ class Feature:
 
     @property
     def is_number(self) -> bool:
-        """Whether it holds numbers, not text, pictures or films."""
+        """Whether it is numeric, and not text, images or videos."""
         return _NUMBERS.fullmatch(self.dtype) is not None
 
     @property
     def role(self) -> str:
-        """`action` where it holds commands, by its name; else `state`."""
+        """`action` for commands, by its name; else `state`."""
         acted = self.name in ("action", "actions") or self.name.startswith("action.")
         return "action" if acted and self.is_number else "state"
 
@@ -56,7 +56,7 @@ class Feature:
         return self.is_number and self.width == 1 and time_column_of([last]) is not None
 
     def channels(self, *, alone: bool) -> list[str]:
-        """A name per number; after the feature's where others are read, too."""
+        """A name per number, with the feature's name as a prefix if others are read."""
         if self.labels:
             return list(self.labels) if alone else [f"{self.name}.{label}" for label in self.labels]
         if self.width == 1:
@@ -66,7 +66,7 @@ class Feature:
 
 @dataclass(frozen=True)
 class Rows:
-    """Where an episode is: a file, and how many rows it has there."""
+    """The location of an episode: a file, and its number of rows there."""
 
     file: Path
     length: int | None
@@ -86,7 +86,7 @@ class Info:
 
     @classmethod
     def of(cls, root: Path) -> Info:
-        """Reads and checks it."""
+        """Reads and checks the metadata."""
         path = require_file(root / "meta" / "info.json")
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
@@ -195,9 +195,9 @@ class Info:
 
 
 def _labels(feature: dict[str, Any]) -> tuple[str, ...]:
-    """One name per number, unique, or none where `names` says something else, such as axes."""
+    """One unique name per number, or none if `names` is something else, such as axes."""
     names = feature.get("names")
-    if isinstance(names, dict):  # {"motors": [...]}; in others, a name and its place
+    if isinstance(names, dict):  # {"motors": [...]}; in others, a name and its position
         values = list(names.values())
         names = list(names) if all(isinstance(v, int) for v in values) else values
     while isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):

@@ -32,28 +32,28 @@ def read_npz(
     """Reads recordings from an NPZ file; nothing in it is unpickled.
 
     The times have shape (rows,), and every other array of numbers whose first axis is as long gives
-    channels: one of shape (rows,) is called like its array, the columns of one of shape (rows, k)
-    `array.0`, `array.1`, ..., or as an array `names` of k texts says, where there is one matrix;
-    `units` likewise. Or the times have shape (episodes, rows), and the others one axis more, too;
-    rows whose time is NaN are padding. Other arrays are left out, which is noted.
+    channels: an array of shape (rows,) gives its name, the columns of one of shape (rows, k) are
+    `array.0`, `array.1`, ..., or named by an array `names` of k texts if there is one matrix;
+    `units` is used in the same way. Or times have shape (episodes, rows), and the others one axis
+    more; rows whose time is NaN are padding. Other arrays are left out, which is noted.
 
     Args:
         path: the file.
         time_column: the array of times; by default found by its name, see `TIME_NAMES`.
-        trajectory_column: the array, of shape (rows,), that says to which trajectory a row belongs;
+        trajectory_column: the array, of shape (rows,), with the trajectory of each row;
             by default found by its name, see `LABEL_NAMES`.
-        channels: the channels to read, in the order wanted; by default all.
-        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the array's name or type says,
-            else found by the numbers, which is noted, else `s`.
+        channels: the channels to read, in this order; by default all.
+        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default from the array's name or type,
+            else detected from the numbers, which is noted, else `s`.
         units: unit of a channel by its name.
 
     Returns:
         A recording per trajectory.
 
     Raises:
-        FileFormatError: the file is missing, empty, truncated, no NPZ, or holds pickled objects; it
+        FileFormatError: the file is missing, empty, truncated, not NPZ, or has pickled objects; it
             has no times, or no array with a row per time.
-        InputError: an option names an array or a unit that there is not.
+        InputError: an option names an unknown array or unit.
     """
     path = require_file(path)
     _check_size(path)
@@ -126,18 +126,18 @@ def read_npz(
 
 
 def _check_size(path: Path) -> None:
-    """Raises an error where the arrays, once unpacked, and the values made of them do not fit."""
+    """Raises an error if the unpacked arrays and the values made from them do not fit."""
     try:
         with zipfile.ZipFile(path) as file:
             size = sum(member.file_size for member in file.infolist())
     except (zipfile.BadZipFile, OSError):
-        return  # it is refused when it is read
+        return  # reading it raises an error
     require_memory(path, 2 * size, f"{size} bytes of arrays")
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        # NumPy leaves a file open that it opens itself and can't read.
+        # NumPy does not close a file that it cannot read.
         with path.open("rb") as opened:
             file = np.load(opened, allow_pickle=False)
             if not isinstance(file, np.lib.npyio.NpzFile):
@@ -183,7 +183,7 @@ def _unit_of_dates(path: Path, clock: NDArray[Any]) -> str:
 def _channels(
     arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]
 ) -> tuple[list[str], list[str], list[NDArray[Any]], list[str]]:
-    """Names, units and columns of the channels, and the names of the arrays that give none."""
+    """Names, units and columns of the channels, and the names of the other arrays."""
     axes = len(shape)
     fitting = {
         name: array
@@ -224,7 +224,7 @@ def _channels(
 def _by_episode(
     clock: NDArray[Any], values: NDArray[np.float64]
 ) -> tuple[NDArray[Any], list[str], NDArray[np.float64]]:
-    """Episodes one after the other, without the padding."""
+    """Joins episodes, without the padding."""
     there = ~np.isnan(clock) if clock.dtype.kind == "f" else np.ones(clock.shape, dtype=bool)
     labels = np.repeat(np.arange(len(clock)), there.sum(axis=1))
     return clock[there], [str(label) for label in labels.tolist()], values[:, there]

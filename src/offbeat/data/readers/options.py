@@ -1,4 +1,4 @@
-"""Options that readers of topics and tables share: names, and fields of topics."""
+"""Options of several readers: names, and fields of topics."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from offbeat.errors import InputError, one_of
 
 
 def names(option: str, given: Iterable[str] | None) -> tuple[str, ...] | None:
-    """The names that an option gives: several, one as a plain string, or None.
+    """The names given by an option: several, one as a plain string, or None.
 
     Raises:
-        InputError: they are no names, or there are none.
+        InputError: they are not names, or there are none.
     """
     if given is None:
         return None
@@ -22,17 +22,17 @@ def names(option: str, given: Iterable[str] | None) -> tuple[str, ...] | None:
 
 
 class Fields:
-    """Which fields of which topics are asked for; remembers which of them it met.
+    """The selected fields of topics; records which of them were found.
 
-    A field is asked for by its path, which means all below it, too: `pose` has `pose.position.x`
-    and `q` has `q[0]`. `topic:path` asks for it in one topic alone.
+    A field is selected by its path, which includes all fields below: `pose` has `pose.position.x`
+    and `q` has `q[0]`. `topic:path` selects it in one topic only.
 
     Args:
-        fields: what is asked for; None for the defaults of the format.
+        fields: selected fields; None for the defaults of the format.
         topics: the topics that are read.
 
     Raises:
-        InputError: a topic is none of these.
+        InputError: a topic is not one of these.
     """
 
     def __init__(self, fields: Iterable[str] | None, topics: Iterable[str]) -> None:
@@ -51,7 +51,7 @@ class Fields:
             self._patterns.append((topic, path))
 
     def of(self, topic: str) -> Callable[[str], bool] | None:
-        """Whether a channel of this topic is asked for; None where the defaults hold."""
+        """Returns a test whether a channel of this topic is selected; None for the defaults."""
         if self._patterns is None:
             return None
         mine = [pattern for pattern in self._patterns if pattern[0] in ("", topic)]
@@ -64,7 +64,7 @@ class Fields:
         return wanted
 
     def check(self) -> None:
-        """Raises `InputError` for a field that no topic has; it lists those `available`."""
+        """Raises `InputError` for a field that no topic has; lists the available ones."""
         for pattern in self._patterns or ():
             if pattern not in self._met:
                 one_of("field", pattern[1], self.available)

@@ -1,4 +1,4 @@
-"""Parquet that other programs wrote: tables of pandas, Polars, Spark, DuckDB, ..."""
+"""Parquet of other programs: tables of pandas, Polars, Spark, DuckDB, ..."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError
 
-_ROWS = 1 << 16  # in memory at a time, beside the result
+_ROWS = 1 << 16  # in memory at a time, besides the result
 _BUFFER = 1 << 18  # bytes of a column as it is stored, in memory at a time
 _THREADS = 4  # columns that are read at once, at most
-_MANY = 1 << 20  # values that are worth a thread
-_INDEX = "__index_level_0__"  # what pandas calls an index without a name
+_MANY = 1 << 20  # minimum number of values per thread
+_INDEX = "__index_level_0__"  # name that pandas gives to an unnamed index
 
 
 def read_parquet(
@@ -37,30 +37,30 @@ def read_parquet(
 ) -> list[Recording]:
     """Reads recordings from Parquet: a row per time, or one per measured value.
 
-    Columns are taken as in CSV. A column of time stamps or durations knows its unit. A column of
-    lists of one length gives a channel per place, `name.0`, `name.1`, ... The file is read 65,536
-    rows at a time.
+    Columns have the same meaning as in CSV. Columns of time stamps or durations have a unit. A
+    column of lists of one length gives a channel per element, `name.0`, `name.1`, ... The file is
+    read 65,536 rows at a time.
 
     Args:
         path: the file.
         time_column: the column of times; by default found by its name, see `TIME_NAMES`, or the
             index of pandas where it holds time stamps.
-        trajectory_column: the column that says to which trajectory a row belongs; by default found
+        trajectory_column: the column with the trajectory of each row; by default found
             by its name, see `LABEL_NAMES`.
-        channels: the columns to read as channels, in the order wanted; by default all.
-        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's type or name says,
-            else found by the numbers, which is noted, else `s`.
+        channels: the columns to read as channels, in this order; by default all.
+        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default from the column's type or name,
+            else detected from the numbers, which is noted, else `s`.
         units: unit of a channel by its name.
-        channel_column: the column that says which channel a value is of, in the long form.
+        channel_column: the column with the channel of each value, in the long form.
         value_column: the column of values, in the long form.
 
     Returns:
         A recording per trajectory, in the order of their first rows; null is NaN.
 
     Raises:
-        FileFormatError: the file is missing, empty, truncated, no Parquet, has no time, or a
-            channel that is no number.
-        InputError: an option names a column or a unit that there is not.
+        FileFormatError: the file is missing, empty, truncated, not Parquet, has no time, or a
+            channel that is not numeric.
+        InputError: an option names an unknown column or unit.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -68,7 +68,7 @@ def read_parquet(
     path = require_file(path)
     try:
         with ExitStack() as opened:
-            # Else a whole row group, which can be all of the file, would lie in memory.
+            # Otherwise a whole row group, which can be the whole file, is in memory.
             bounded = {"pre_buffer": False, "buffer_size": _BUFFER}
             file = opened.enter_context(pq.ParquetFile(path, **bounded))
             schema = file.schema_arrow
@@ -122,13 +122,13 @@ def read_parquet(
 
 
 def _chunks(file: Any, name: str) -> Iterator[Any]:
-    """The Arrow arrays of a column, one after the other."""
+    """Yields the Arrow arrays of a column."""
     for batch in file.iter_batches(_ROWS, columns=[name], use_threads=False):
         yield batch.column(name)
 
 
 def _names(schema: Any, time_column: str | None) -> list[str]:
-    """The columns, without the index that pandas stored, unless it is the time."""
+    """The columns, without the index of pandas unless it is the time."""
     wanted = time_column or _index_of_times(schema)
     return [name for name in schema.names if name != _INDEX or name == wanted]
 
@@ -208,7 +208,7 @@ def _width(path: Path, name: str, chunks: Iterator[Any]) -> int:
 
 
 def _spread(columns: Columns, widths: Mapping[str, int]) -> Columns:
-    """A name and a unit per channel, where a column has several."""
+    """Expands columns of lists to a name and a unit per channel."""
     if not widths:
         return columns
     names: list[str] = []

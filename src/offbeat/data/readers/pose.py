@@ -16,9 +16,9 @@ from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, InputError, one_of
 
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
-"""The eight numbers of a line of TUM: seconds, metres, and a quaternion with its scalar last."""
+"""The eight numbers of a line of TUM: seconds, metres, and a scalar-last quaternion."""
 
-_COPIES = 3  # of a text in memory, while it is read
+_COPIES = 3  # copies of a text in memory while it is read
 
 _TUM = Columns("timestamp", None, TUM_COLUMNS[1:], TUM_COLUMNS[1:], ("m",) * 3 + ("",) * 4)
 
@@ -35,7 +35,7 @@ def read_tum(path: str | Path) -> list[Recording]:
         path: the file, in UTF-8.
 
     Raises:
-        FileFormatError: the file is missing or empty, or a line is no eight numbers.
+        FileFormatError: the file is missing or empty, or a line does not have eight numbers.
     """
     import io
 
@@ -75,7 +75,7 @@ def read_tum(path: str | Path) -> list[Recording]:
 
 
 def is_tum(path: Path) -> bool:
-    """Whether the first line of numbers of a text has eight of them, with spaces between."""
+    """Whether the first line of numbers of a text has eight of them, separated by spaces."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             for _ in range(1000):
@@ -92,20 +92,20 @@ def is_tum(path: Path) -> bool:
 def read_euroc(path: str | Path, *, sensors: Sequence[str] | None = None) -> list[Recording]:
     """Reads a EuRoC MAV sequence, or one of its files.
 
-    A file is CSV whose header begins with `#timestamp`, in nanoseconds, and says units in brackets.
+    A file is CSV whose header starts with `#timestamp`, in nanoseconds, and has units in brackets.
     A folder holds one sensor per folder, each with its `data.csv`, here or in `mav0`; the sensors
-    are merged on the union of their stamps. Those whose data are not numbers (the pictures of a
+    are merged on the union of their stamps. Those with data that are not numbers (images of a
     camera) are left out, which is noted.
 
     Source: Burri et al., The EuRoC micro aerial vehicle datasets, IJRR 35(10), 2016.
 
     Args:
         path: the file, or the folder.
-        sensors: the folders to read, such as `imu0`; by default all that hold numbers.
+        sensors: the folders to read, such as `imu0`; by default all with numeric data.
 
     Raises:
-        FileFormatError: a file is missing, empty or damaged, or no sensor holds numbers.
-        InputError: a sensor is asked for that there is not.
+        FileFormatError: a file is missing, empty or damaged, or no sensor has numeric data.
+        InputError: an unknown sensor is selected.
     """
     path = Path(path)
     if not path.is_dir():
@@ -147,7 +147,7 @@ def _data_files(folder: Path) -> list[Path]:
 
 
 def _holds_numbers(path: Path) -> bool:
-    """Whether the first row of a CSV is numbers alone."""
+    """Whether the first row of a CSV has only numbers."""
     with path.open(encoding="utf-8-sig") as file:
         file.readline()
         row = file.readline(100_000)
@@ -160,7 +160,7 @@ def _kinds(channels: Sequence[str]) -> tuple[str, ...]:
 
 
 def _numbers(line: str) -> int:
-    """How many numbers a line has; -1 if anything else is in it."""
+    """Number of numbers in a line; -1 if it contains anything else."""
     try:
         return len([float(word) for word in line.split()])
     except ValueError:
@@ -168,7 +168,7 @@ def _numbers(line: str) -> int:
 
 
 def _explain(path: Path) -> None:
-    """Raises an error that names the wrong line, if there is one."""
+    """Raises an error that names the invalid line, if there is one."""
     try:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(file, 1):

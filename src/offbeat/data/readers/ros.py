@@ -1,8 +1,8 @@
 """ROS 1 bags, ROS 2 bags in SQLite (.db3) and MCAP, through `rosbags`.
 
 `rosbags` opens the containers and parses the definitions of the messages; `ros_layout` decodes the
-topics and fields that are asked for, thousands of messages at once. Memory holds what is returned
-and a few megabytes of messages that wait to be decoded, however large the bag is.
+selected topics and fields, thousands of messages at once. Memory use is the result
+and a few megabytes of messages that wait to be decoded, for any size of the bag.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SUFFIXES = (".bag", ".db3", ".mcap")
 _MAGIC = (b"#ROSBAG V", b"SQLite format 3\0", b"\x89MCAP0\r\n")
 _WAITING_BYTES = 16 * 2**20  # messages that wait to be decoded
 
-# Pictures, maps and texts are no channels unless they are asked for.
+# Images, maps and texts are not channels unless they are selected.
 _NOT_BY_DEFAULT = (
     "bond/",
     "diagnostic_msgs/",
@@ -44,7 +44,7 @@ _NOT_BY_DEFAULT = (
 
 
 def recognises(path: Path) -> bool:
-    """Whether a file starts like a ROS bag or an MCAP file, or a folder holds a ROS 2 bag."""
+    """Whether a file has the signature of a ROS bag or MCAP, or a folder is a ROS 2 bag."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     return starts_with(path, _MAGIC)
@@ -62,24 +62,24 @@ def recordings(
 
     Args:
         path: a .bag, .db3 or .mcap file, or the folder of a ROS 2 bag.
-        topics: the topics to read; by default all whose messages hold numbers, but for pictures,
+        topics: the topics to read; by default all whose messages contain numbers, except images,
             scans, maps, markers, logs and transforms that never change.
-        fields: fields to take, such as `pose.position` (with all below it), `velocity[0]`, or
+        fields: fields to read, such as `pose.position` (with all below it), `velocity[0]`, or
             `/odom:twist.twist` for one topic alone; by default all numbers but covariances, long
             sequences, and what the header holds.
-        stamps: `header` takes the stamps of the messages' headers, and the time of receipt where
-            there is none; `receive` takes the time of receipt everywhere.
-        typestore: the ROS distribution whose definitions are taken where a bag holds none, such
+        stamps: `header` uses the stamps of the messages' headers, and the time of receipt if
+            there is none; `receive` uses the time of receipt everywhere.
+        typestore: the ROS distribution whose definitions are used if a bag has none, such
             as `ros2_humble`.
 
     Yields:
-        The recording. Sequences of numbers become a channel per element, named by the message's
-        own names where it has as many (`position.elbow` of joint states). A list of transforms
+        The recording. Sequences of numbers become a channel per element, named by the message
+        if it has as many names (`position.elbow` of joint states). A list of transforms
         becomes a signal per child frame.
 
     Raises:
-        FileFormatError: the bag is truncated or damaged, a message type is not known, or nothing
-            that was asked for holds a number.
+        FileFormatError: the bag is truncated or damaged, a message type is unknown, or nothing
+            selected is a number.
         InputError: a topic, field or option is unknown.
         MissingExtraError: `rosbags` is not installed.
     """
@@ -149,7 +149,7 @@ def _topic_readers(
     *,
     asked: bool,
 ) -> dict[str, Topic]:
-    """A reader per topic that is to be read and whose messages are defined."""
+    """A reader per selected topic whose messages are defined."""
     from rosbags.typesys import Stores, get_typestore
 
     stores = {store.value: store for store in Stores if store.value.startswith(("ros2", "latest"))}
@@ -199,7 +199,7 @@ def _topic_readers(
 
 
 def _read(bag: Bag, chosen: list[Connection], readers: dict[str, Topic], path: Path) -> None:
-    """Hands every message of the chosen topics to its reader, a batch at a time."""
+    """Passes the messages of the chosen topics to their readers in batches."""
     batches = {c.id: readers[c.topic] for c in chosen if c.topic in readers}
     waiting = 0
     try:
@@ -221,10 +221,10 @@ def _read(bag: Bag, chosen: list[Connection], readers: dict[str, Topic], path: P
 
 
 def _clocks(topics: list[Topic], stamps: str, notes: list[str]) -> dict[str, bool]:
-    """Whether each topic takes the stamps of its headers.
+    """Whether each topic uses the stamps of its headers.
 
-    Topics without a header have the time of receipt alone. Where that clock and the one of the
-    headers have no time in common (a simulator's clock, a bag played again), all take the time of
+    Topics without a header have only the time of receipt. If that clock and the one of the
+    headers do not overlap (a simulator's clock, a replayed bag), all use the time of
     receipt: merged signals need one clock.
     """
     chosen = {t.name: stamps == "header" and t.has_header for t in topics}
@@ -250,7 +250,7 @@ def _clocks(topics: list[Topic], stamps: str, notes: list[str]) -> dict[str, boo
             return dict.fromkeys(chosen, False)
     if without:
         notes.append(
-            "stamps are times of receipt, for want of a header stamp, in "
+            "stamps are times of receipt, because there is no header stamp, in "
             + ", ".join(t.name for t in without)
         )
     return chosen

@@ -1,7 +1,7 @@
-"""The containers of ROS messages, opened: bags of ROS 1 and, through `rosbags`, those of ROS 2.
+"""Containers of ROS messages: bags of ROS 1 and, through `rosbags`, those of ROS 2.
 
 A bag of ROS 1 (format 2.0, wiki.ros.org/Bags/Format/2.0) is read here, chunk by chunk in the order
-of the file: every chunk is decompressed once, chunks without a chosen topic not at all, and no
+of the file: every chunk with a chosen topic is decompressed once, and no
 index of all messages is built, so memory does not grow with the bag.
 """
 
@@ -22,7 +22,7 @@ from offbeat.errors import FileFormatError, OffbeatError, require
 
 @dataclass(frozen=True)
 class Connection:
-    """Who wrote messages of which type to which topic.
+    """A connection of a bag: a topic and the type of its messages.
 
     Args:
         id: number that messages refer to.
@@ -30,7 +30,7 @@ class Connection:
         kind: type of its messages, such as `sensor_msgs/msg/Imu`.
         encoding: how they are serialised, `ros1`, `cdr` or another.
         form: language of the definition, `msg`, `idl` or empty.
-        definition: text that defines the type; empty where the bag holds none.
+        definition: text that defines the type; empty if the bag has none.
     """
 
     id: int
@@ -41,7 +41,7 @@ class Connection:
     definition: str
 
     def parsed(self) -> dict[str, Any]:
-        """Fields of each message type that the definition holds; parsed by `rosbags`."""
+        """Fields of each message type in the definition, parsed by `rosbags`."""
         from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
         if self.form == "msg":
@@ -61,9 +61,9 @@ class Bag:
     """An open bag.
 
     Args:
-        connections: who wrote what.
-        messages: gives, for numbers of connections, the number, the time of receipt in
-            nanoseconds and the serialised message, one after the other.
+        connections: of the bag.
+        messages: takes ids of connections; yields the id, the time of receipt in
+            nanoseconds and the serialised message.
         cdr: serialised by ROS 2.
     """
 
@@ -140,7 +140,7 @@ def _open_ros2(path: Path) -> Iterator[Bag]:
 
 
 def _check_length(path: Path) -> None:
-    """Raises for a truncated SQLite file, which SQLite notices only when it reads the end."""
+    """Raises an error for a truncated SQLite file, which SQLite detects only at its end."""
     with path.open("rb") as file:
         start = file.read(100)  # the header: sqlite.org/fileformat.html, section 1.3
     if len(start) < 100 or not start.startswith(b"SQLite format 3"):
@@ -155,7 +155,7 @@ def _check_length(path: Path) -> None:
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turns whatever is raised over a damaged file into one line."""
+    """Converts errors about a damaged file to one line."""
     try:
         yield
     except FileFormatError as error:
@@ -180,7 +180,7 @@ _SHORT = "it ends in the middle of a record"
 
 
 class _Bag1:
-    """A bag of ROS 1: its connections, and where its chunks are."""
+    """A bag of ROS 1: its connections, and the positions of its chunks."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file = file
@@ -238,7 +238,7 @@ class _Bag1:
         )
 
     def messages(self, ids: set[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Number of the connection, time of receipt and message, in the order of the file."""
+        """Yields id of the connection, time of receipt and message, in the order of the file."""
         for position in sorted(p for p, inside in self.chunks.items() if inside & ids):
             self.file.seek(position)
             header, data = self._record()

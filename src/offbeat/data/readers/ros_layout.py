@@ -1,9 +1,9 @@
 """The places of the numbers in a serialised ROS message, and decoding thousands of them at once.
 
-Messages of one topic mostly have one layout: the same length, the same lengths of strings and
-sequences. So a layout is found once, by parsing one message, and all messages that agree with
+Messages of one topic usually have one layout: the same length, the same lengths of strings and
+sequences. So a layout is found once by parsing one message, and all messages that agree with
 it in these lengths are decoded together, as columns of one table of bytes. Nothing is done per
-message in Python, and what is not asked for is never decoded.
+message in Python, and fields that are not selected are not decoded.
 
 The layouts: ROS 1 writes fields one after the other, little endian, strings and sequences after
 their length (wiki.ros.org/msg). ROS 2 writes CDR (OMG formal/02-06-51, 9.3): four bytes that say
@@ -27,7 +27,7 @@ Definitions = Mapping[str, tuple[Any, Any]]
 """Fields of each message type, as `rosbags` parses them: name and description of every field."""
 
 WIDEST = 64
-"""Longest sequence whose elements become channels without being asked for."""
+"""Longest sequence whose elements become channels by default."""
 
 _BASE, _NAME, _ARRAY = 1, 2, 3  # node types of a field's description; 4 is a sequence
 _CODES = {
@@ -50,7 +50,7 @@ _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _QUATERNION = "geometry_msgs/msg/Quaternion"
 _NAMES = ("name", "names", "joint_names")
 
-# Units that the definitions of the messages themselves, or REP 103, state.
+# Units from the definitions of the messages, or from REP 103.
 _UNITS = {
     "geometry_msgs/msg/Pose": {"position": "m"},
     "geometry_msgs/msg/PointStamped": {"point": "m"},
@@ -74,9 +74,9 @@ class Column:
 
     Args:
         name: path of its field, such as `pose.position.x` or `effort[2]`.
-        offset: its place in the message, in bytes.
+        offset: its position in the message, in bytes.
         code: its type as NumPy writes it, such as `<f8`.
-        unit: unit, where the definition of the message states one.
+        unit: unit from the definition of the message, or empty.
         kind: `angle`, `quaternion` or empty.
     """
 
@@ -89,12 +89,12 @@ class Column:
 
 @dataclass
 class Row:
-    """The values of one message at one time: a row of one signal.
+    """The values of one message at one time: a row of a signal.
 
     Args:
-        suffix: what the signal's name has beside the topic's: the child frame of a transform.
+        suffix: suffix of the signal's name after the topic: the child frame of a transform.
         columns: the channels.
-        stamp: places of seconds and nanoseconds of the header's stamp; None without a header.
+        stamp: positions of seconds and nanoseconds of the header's stamp; None without a header.
     """
 
     suffix: str = ""
@@ -104,15 +104,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Layout:
-    """The places of all fields in messages of one length that agree in some of their bytes.
+    """The positions of all fields in messages of one length that agree in some of their bytes.
 
     Args:
-        places: (bytes,) the places of these bytes.
+        places: (bytes,) the positions of these bytes.
         expected: (bytes,) the bytes there.
         order: byte order, `<` or `>`.
-        rows: what is taken from a message; several rows from a list of transforms.
+        rows: the rows of a message; several for a list of transforms.
         skipped: fields that are left out, each with the reason.
-        available: fields that could be taken.
+        available: fields that can be selected.
     """
 
     places: NDArray[np.intp]
@@ -140,7 +140,7 @@ class Layout:
         """(messages, channels) the numbers, as float64."""
         values = np.empty((len(table), len(row.columns)))
         first = 0
-        while first < len(row.columns):  # adjacent numbers are taken together
+        while first < len(row.columns):  # adjacent numbers are decoded together
             start = row.columns[first]
             size = int(start.code[-1])
             last = first + 1
@@ -168,14 +168,14 @@ def find_layout(
     cdr: bool,
     wanted: Callable[[str], bool] | None = None,
 ) -> Layout:
-    """Goes through one message and notes the place of each field.
+    """Parses one message and records the position of each field.
 
     Args:
-        message: the message as it was serialised.
+        message: the serialised message.
         kind: its type, such as `sensor_msgs/msg/Imu`.
-        definitions: fields of this type and of those that it holds.
+        definitions: fields of this type and of its nested types.
         cdr: serialised by ROS 2; else by ROS 1.
-        wanted: whether a channel of this name is asked for. By default all numbers are, but for
+        wanted: whether a channel of this name is selected. By default all numbers are, except
             covariances, sequences longer than `WIDEST`, times, and what the header holds.
 
     Raises:
@@ -186,7 +186,7 @@ def find_layout(
         parser.message(kind, "", Row(), "")
     except (struct.error, UnicodeDecodeError) as error:
         raise FileFormatError(
-            f"a message of type {kind} is cut short or damaged ({error})"
+            f"a message of type {kind} is truncated or damaged ({error})"
         ) from None
     rest = len(message) - parser.base - parser.position
     if rest < 0 or rest > (3 if cdr else 0):
@@ -237,7 +237,7 @@ class _Parser:
             self.agreed.update((0, 1))
 
     def message(self, kind: str, path: str, row: Row, unit: str) -> None:
-        """The fields of a message; a message that is no field itself is a row of its own."""
+        """Parses the fields of a message; a message that is not a field is a separate row."""
         if kind not in self.definitions:
             raise FileFormatError(f"the message type {kind} is not defined")
         start = f"{path}." if path else ""
@@ -288,7 +288,7 @@ class _Parser:
             ]
 
     def _messages(self, kind: str, here: str, count: int) -> None:
-        """A list of messages: rows of their own where they are transforms, else left out."""
+        """Parses a list of messages: separate rows if they are transforms, else left out."""
         for _ in range(count):
             mark, known = len(self.rows), len(self.available)
             row = Row()
@@ -338,7 +338,7 @@ class _Parser:
             self.skipped.setdefault(here, "a time")
 
     def _run(self, base: str, count: int) -> tuple[int, str]:
-        """Place and type of adjacent numbers."""
+        """Position and type of adjacent numbers."""
         code = _CODES[base]
         size = int(code[-1])
         if self.cdr:

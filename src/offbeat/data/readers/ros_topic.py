@@ -1,4 +1,4 @@
-"""One topic of a ROS bag, from serialised messages to signals."""
+"""Decoding of a topic of a ROS bag to signals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from offbeat.data.readers.ros_layout import Column, Definitions, Layout, find_la
 from offbeat.data.signals import Signal
 from offbeat.errors import FileFormatError
 
-_LAYOUTS = 64  # remembered per topic and length of message
+_LAYOUTS = 64  # kept per topic and length of message
 
 
 @dataclass
@@ -29,18 +29,18 @@ class _Part:
 
 @dataclass
 class Topic:
-    """A topic while it is read: messages that wait, and what was decoded of those before.
+    """A topic while it is read: waiting messages, and the decoded parts of earlier ones.
 
     Args:
         name: of the topic.
         kind: type of its messages.
-        definitions: fields of that type and of those that it holds.
+        definitions: fields of that type and of its nested types.
         cdr: serialised by ROS 2; else by ROS 1.
-        fields: which fields are asked for.
-        times: times of receipt of the messages that wait, in nanoseconds.
-        messages: the messages that wait.
-        parts: what was decoded, by the suffix of its signal.
-        layouts: layouts that were found, by the length of their messages.
+        fields: the selected fields.
+        times: times of receipt of the waiting messages, in nanoseconds.
+        messages: the waiting messages.
+        parts: decoded rows, by the suffix of their signal.
+        layouts: known layouts, by the length of their messages.
         skipped: fields that are left out, each with the reason.
     """
 
@@ -56,7 +56,7 @@ class Topic:
     skipped: dict[str, str] = field(default_factory=dict)
 
     def decode(self) -> None:
-        """Decodes the messages that wait."""
+        """Decodes the waiting messages."""
         received = np.array(self.times, dtype=np.int64)
         lengths = np.fromiter(map(len, self.messages), dtype=np.intp, count=len(self.messages))
         found: dict[str, list[_Part]] = {}
@@ -135,14 +135,14 @@ class Topic:
         return min(int(s.min()) for s in every), max(int(s.max()) for s in every)
 
     def signals(self, *, header: bool, notes: list[str]) -> Iterator[Signal]:
-        """The signals; what was decoded is given up on the way, to save memory."""
+        """Yields the signals, and releases the decoded parts to save memory."""
         if self.skipped:
             notes.append(
                 f"{self.name}: left out "
                 + ", ".join(f"{name} ({why})" for name, why in self.skipped.items())
             )
         if not self.parts and not self.messages:
-            notes.append(f"{self.name} ({self.kind}) holds no numbers that are asked for")
+            notes.append(f"{self.name} ({self.kind}) has no selected numbers")
         for suffix in list(self.parts):
             parts = self.parts.pop(suffix)
             columns = {c.name: c for part in parts for c in part.columns}
@@ -173,7 +173,7 @@ class Topic:
 
 
 def _in_order(parts: list[_Part]) -> list[_Part]:
-    """The rows of a batch of messages in the order of the log, of all layouts together."""
+    """Joins the rows of all layouts of a batch, in the order of the log."""
     if len(parts) == 1:
         return parts
     order = np.concatenate([part.order for part in parts])
@@ -203,7 +203,7 @@ def _in_order(parts: list[_Part]) -> list[_Part]:
 
 
 def _kinds(columns: list[Column]) -> tuple[str, ...]:
-    """Kinds of the channels; a quaternion of which a part was not asked for is none."""
+    """Kinds of the channels; incomplete quaternions have none."""
     kinds = [c.kind for c in columns]
     for i, column in enumerate(columns):
         whole = [f"{column.name[:-1]}{axis}" for axis in "xyzw"]

@@ -17,10 +17,10 @@ _YEARS = range(1678, 2262)  # of which an int64 of nanoseconds since 1970 holds 
 
 
 def form_of(field: str) -> str | None:
-    """Whether a time is `with` or `without` an offset from UTC; None if the text is no time.
+    """Whether a time is `with` or `without` an offset from UTC; None if the text is not a time.
 
     A time is a date, and most often a T or a space and the time of day, down to nine digits after
-    the second's point; what is small may be left out. The offset is Z, +02, +0200 or +02:00.
+    the second's point; smaller parts may be left out. The offset is Z, +02, +0200 or +02:00.
     """
     match = _STAMP.fullmatch(field)
     if match is None:
@@ -38,13 +38,13 @@ def form_of(field: str) -> str | None:
 def with_stamps(
     batches: Iterable[Any], name: str, form: str, missing: Sequence[str]
 ) -> Iterator[Any]:
-    """Batches whose column of texts becomes one of time stamps in nanoseconds.
+    """Converts a column of texts in batches to time stamps in nanoseconds.
 
     Args:
         batches: `pyarrow.RecordBatch`es.
         name: the column.
-        form: as `form_of` says it of all of its texts.
-        missing: texts that say nothing.
+        form: result of `form_of`, equal for all of its texts.
+        missing: texts of missing values.
 
     Raises:
         ArrowInvalid: a text is no time, or of another form.
@@ -60,7 +60,7 @@ def with_stamps(
 
 
 def expected_after(first: str) -> str:
-    """What the times of a file must be, for messages, by the first of them."""
+    """Expected form of the times of a file, by the first one, for messages."""
     form = form_of(first)
     if form is None:
         return f"a number, or in all rows a time of ISO 8601, such as {EXAMPLE}"

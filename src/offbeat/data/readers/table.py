@@ -25,10 +25,10 @@ MISSING = ("", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL",
 DELIMITERS = (",", ";", "\t")
 """Tried in this order on the header, where none is given."""
 
-_BLANK = tuple(" " * n for n in range(1, 33))  # a field that is padded, and nothing else
+_BLANK = tuple(" " * n for n in range(1, 33))  # fields of padding only
 _BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
 _COMMA = re.compile(r"[+-]?\d+,\d+")
-_SAMPLE = 1000  # lines that decide the type of a column
+_SAMPLE = 1000  # lines from which the type of a column is derived
 _BLOCK = 1 << 20  # bytes of text in memory at a time
 
 
@@ -50,24 +50,24 @@ def read_csv(
     A first column without a name that counts the rows, as pandas writes it, is left out. A unit in
     brackets after a name, as in `speed [m/s]`, is the channel's unit and no part of its name.
     Times keep every digit down to the nanosecond, as numbers and as texts of ISO 8601, whose clock
-    counts nanoseconds since 1970 (in UTC where they say their offset). The file is read a mebibyte
+    counts nanoseconds since 1970 (in UTC if they have an offset). The file is read a mebibyte
     at a time.
 
     Args:
         path: the file, in UTF-8.
         time_column: the column of times; by default found by its name, see `TIME_NAMES`.
-        trajectory_column: the column that says to which trajectory a row belongs, by a number or
+        trajectory_column: the column with the trajectory of each row, as a number or
             any text; by default found by its name, see `LABEL_NAMES`. Without one, the file is one
             trajectory.
         channels: the columns to read as channels (in the long form: their names in the column of
-            channels), in the order wanted; by default all.
-        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default what the column's name says, else
-            found by the numbers, which is noted, else `s`. Times of ISO 8601 need none.
+            channels), in this order; by default all.
+        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default from the column's name, else
+            detected from the numbers, which is noted, else `s`. Times of ISO 8601 need none.
         units: unit of a channel by its name.
         delimiter: the character between two fields; by default a comma, or the semicolon or tab
             that the header has instead.
-        channel_column: the column that says which channel a value is of, in the long form; by
-            default found where the table has a `channel` and a `value` and nothing else.
+        channel_column: the column with the channel of each value, in the long form; by
+            default used if the table has only a time, a `channel` and a `value`.
         value_column: the column of values, in the long form.
         decimal: the decimal separator of numbers, `.` or `,`.
 
@@ -76,9 +76,9 @@ def read_csv(
         another of `MISSING`, is NaN.
 
     Raises:
-        FileFormatError: the file is missing or empty, its header or a row is not as it must be, or
+        FileFormatError: the file is missing or empty, its header or a row is invalid, or
             a field is not a number.
-        InputError: an option names a column or a unit that there is not.
+        InputError: an option names an unknown column or unit.
     """
     if delimiter is not None and (
         len(delimiter) != 1 or not delimiter.isascii() or delimiter in '"\r\n'
@@ -121,14 +121,14 @@ def read_csv(
 
 @dataclass(frozen=True)
 class _CsvFile:
-    """A CSV file: read fast by pyarrow, and line by line where an error needs its place."""
+    """A CSV file, read by pyarrow, and line by line to locate errors."""
 
     path: Path
     delimiter: str
     decimal: str
 
     def with_delimiter_of_header(self) -> _CsvFile:
-        """The same file, with the delimiter that its header has."""
+        """The same file, with the delimiter of its header."""
         _, fields = next(self._lines(), (0, [""]))
         if len(fields) == 1:
             for delimiter in DELIMITERS[1:]:
@@ -166,7 +166,7 @@ class _CsvFile:
         return fields == [str(first + i) for i in range(len(fields))]
 
     def _is_empty(self, place: int) -> bool:
-        """Whether a column holds nothing, in the first lines."""
+        """Whether a column is empty in the first lines."""
         lines = itertools.islice(self._lines(), 1, _SAMPLE)
         return not any(field.strip() for _, fields in lines for field in fields[place:])
 
@@ -179,7 +179,7 @@ class _CsvFile:
     def columns(
         self, header: list[str], sample: dict[str, list[str]], columns: Columns, unit: str
     ) -> tuple[Gathered, str]:
-        """The columns that are needed, and the unit that the clock is in now."""
+        """The needed columns, and the unit of the clock."""
         import pyarrow as pa
 
         types = {name: _type_of(sample[name]) for name in columns.channels}
@@ -236,7 +236,7 @@ class _CsvFile:
             yield from reader
 
     def _count_lines(self) -> int:
-        """Of the file, header included: at least the number of rows."""
+        """Number of lines including the header, an upper bound of the number of rows."""
         ends = returns = 0
         last = b""
         with self.path.open("rb") as file:
@@ -247,7 +247,7 @@ class _CsvFile:
         return max(ends, returns) + (last not in b"\r\n")
 
     def line_of(self, row: int) -> int:
-        """The line in which a row of data ends, counted from 1; the header is line 1."""
+        """The line in which a row of data ends; the header is line 1."""
         return next(line for i, (line, _) in enumerate(self._lines()) if i == row + 1)
 
     def _empty(self, error: NullValueError, columns: Columns) -> FileFormatError:
@@ -263,7 +263,7 @@ class _CsvFile:
         )
 
     def _explain(self, header: list[str], columns: Columns, sample: dict[str, list[str]]) -> None:
-        """Raises an error that names the wrong line and column, if it finds them."""
+        """Raises an error that names the invalid line and column, if found."""
         first = _first_time(sample, columns)
         form = form_of(first)
         truths = [name for name in columns.channels if _holds_booleans(sample[name])]
@@ -303,7 +303,7 @@ class _CsvFile:
             number = float(field)
         except ValueError:
             return None
-        # Python allows _ between digits, and digits of other scripts; other programs do not.
+        # Python allows _ between digits, and digits of other scripts; CSV does not.
         return number if field.isascii() and "_" not in field else None
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
@@ -321,7 +321,7 @@ class _CsvFile:
 
 
 def _first_time(sample: dict[str, list[str]], columns: Columns) -> str:
-    """The first field of the clock that is not empty, or an empty one."""
+    """The first non-empty field of the clock, or an empty one."""
     return next((field for field in sample[columns.time] if field not in MISSING), "")
 
 

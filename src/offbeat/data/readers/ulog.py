@@ -1,7 +1,7 @@
 """PX4 flight logs (ULog), through `pyulog`: every topic with its own stamps.
 
-The format: docs.px4.io, "ULog File Format". A log that was cut off, as by a loss of power, is read
-up to there, and the cut is noted; so are dropouts, which the autopilot logs itself.
+The format: docs.px4.io, "ULog File Format". A log that was cut off, for example by a power failure,
+is read up to there, and the cut is noted; so are dropouts, which the autopilot logs itself.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ DEFAULTS = {
     "vehicle_angular_velocity": ("xyz",),
     "vehicle_local_position": ("x", "y", "z", "vx", "vy", "vz"),
 }
-"""Topics, and their fields, that are read where none are asked for: how the vehicle moves."""
+"""Topics and fields that are read by default: the motion of the vehicle."""
 
-_LATEST_US = 2**53  # 285 years; a later stamp is damage
+_LATEST_US = 2**53  # 285 years; a later stamp is damaged
 
-# By the definitions of PX4's messages.
+# From the definitions of PX4's messages.
 _UNITS = {
     "sensor_combined": {
         "gyro_rad": "rad/s",
@@ -69,7 +69,7 @@ def recordings(
         path: the file.
         topics: topics to read with all their instances (`sensor_accel`), or with one
             (`sensor_accel:1`); by default those of `DEFAULTS`.
-        fields: fields to take, such as `q` (with all its elements) or `gyro_rad[0]`, or, of one
+        fields: fields to read, such as `q` (with all its elements) or `gyro_rad[0]`, or, of one
             topic alone, `vehicle_attitude:q`; by default all numbers of the topics that were asked
             for, except further stamps.
 
@@ -77,7 +77,7 @@ def recordings(
         The recording, with stamps of the autopilot's clock.
 
     Raises:
-        FileFormatError: the file is no ULog, is cut off before any data, or holds none of the
+        FileFormatError: the file is not ULog, is cut off before any data, or has none of the
             topics.
         InputError: a topic, instance or field is unknown.
         MissingExtraError: `pyulog` is not installed.
@@ -136,7 +136,7 @@ def _instances(data: list[Any]) -> list[str]:
 
 
 class _Wanted(Container[str]):
-    """The topics to read, as `pyulog` asks for them; remembers all that it asked for."""
+    """The topics to read, for `pyulog`; records all topics in the log."""
 
     def __init__(self, names: Container[str]) -> None:
         self.names = names
@@ -148,13 +148,13 @@ class _Wanted(Container[str]):
 
 
 class _Watched(io.BufferedReader):
-    """A file that notes whether it ends in the middle of a message, which `pyulog` does not say."""
+    """A file that records whether it ends in the middle of a message."""
 
     cut = False
 
     def read(self, size: int | None = -1) -> bytes:
         data = super().read(size)
-        # A log that is whole ends where the next header, of 3 bytes, would start.
+        # A complete log ends where the next header, of 3 bytes, would start.
         if size is not None and len(data) < size and (data or size != 3):
             self.cut = True
         return data
@@ -167,7 +167,7 @@ def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
     printed = io.StringIO()
     file = _Watched(io.FileIO(path))
     try:
-        with contextlib.redirect_stdout(printed):  # it prints what it finds damaged
+        with contextlib.redirect_stdout(printed):  # it prints errors
             log = ULog(file, wanted)
     except Exception as error:
         file.close()
@@ -185,25 +185,25 @@ def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
     if log.file_corruption:
         lines = printed.getvalue().splitlines()
         why = f" ({lines[0]})" if lines else ""
-        notes.append(f"the file is damaged{why}; what could be made out is read")
+        notes.append(f"the file is damaged{why}; readable parts are read")
     elif file.cut:
         seconds = (log.last_timestamp - log.start_timestamp) / 1e6
         notes.append(
-            f"the file is cut off in the middle of a message, as by a loss of power; what comes "
-            f"before is read, {seconds:.3f} s"
+            f"the file is cut off in the middle of a message, as by a power failure; the part "
+            f"before it is read, {seconds:.3f} s"
         )
     if log.dropouts:
         longest = max(log.dropouts, key=lambda d: d.duration)
         notes.append(
             f"the autopilot logged {len(log.dropouts)} dropouts, "
-            f"{sum(d.duration for d in log.dropouts)} ms in all, the longest of "
+            f"{sum(d.duration for d in log.dropouts)} ms in total, the longest of "
             f"{longest.duration} ms at {(longest.timestamp - log.start_timestamp) / 1e6:.3f} s"
         )
     return log, notes
 
 
 def _fields(data: Any, fields: Fields, *, asked: bool) -> list[str]:
-    """The names of the fields of a topic that are taken, in the order of the log."""
+    """The selected fields of a topic, in the order of the log."""
     numbers = [f.field_name for f in data.field_data if f.type_str != "char"]
     fields.available.update(dict.fromkeys(name.partition("[")[0] for name in numbers))
     wanted = fields.of(data.name)

@@ -24,7 +24,7 @@ class Writer:
     Args:
         name: of the format.
         suffixes: file name suffixes, in lower case, each with its dot.
-        function: writes a data set to a path, whole or not at all.
+        function: writes a data set to a path, atomically.
     """
 
     name: str
@@ -43,11 +43,11 @@ def register_writer(
     suffixes: Iterable[str],
     replace: bool = False,
 ) -> Writer:
-    """Adds a format to those that `save` writes.
+    """Registers a format for `save`.
 
     Args:
         name: of the format.
-        function: writes a data set to a path, whole or not at all.
+        function: writes a data set to a path, atomically.
         suffixes: file name suffixes, in lower case, each with its dot.
         replace: allow a name that is taken.
 
@@ -58,9 +58,9 @@ def register_writer(
 
 
 def save(dataset: Dataset, path: str | Path, *, format: str | None = None) -> None:
-    """Writes a data set to a file, whole or not at all.
+    """Writes a data set to a file, atomically.
 
-    `.parquet` is Offbeat's own format: `load` and `read` give the data set back to the last bit.
+    `.parquet` is Offbeat's own format: `load` and `read` restore the data set exactly.
     `.csv` and the format `table` (`.pq`, plain Parquet) are tables for other programs: a row per
     time, and the columns `trajectory`, `time` and one per channel, called `name [unit]`. They have
     no masks, roles and meta; values that are not observed are written all the same.

@@ -16,9 +16,9 @@ from offbeat.files import atomic_path
 
 
 def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
-    """Writes columns as CSV or Parquet, by the suffix of `path`; whole or not at all.
+    """Writes columns as CSV or Parquet by the suffix of `path`, atomically.
 
-    Floats are written to the last bit; in CSV a NaN is an empty field.
+    Floats are written exactly; in CSV a NaN is an empty field.
 
     Args:
         path: the file, `.csv`, `.parquet` or `.pq`; an existing one is replaced.
@@ -90,7 +90,7 @@ def _write_csv(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     texts = [column for column in columns if pa.types.is_string(column.type)]
     special = any(pc.any(pc.match_substring_regex(text, '[",\r\n]')).as_py() for text in texts)
     options = pv.WriteOptions(
-        include_header=False,  # pyarrow's has every name in quotes
+        include_header=False,  # pyarrow quotes every name
         quoting_style="needed" if special else "none",
     )
     with path.open("w", encoding="utf-8", newline="") as file:
@@ -106,6 +106,6 @@ def _csv_column(array: NDArray[Any]) -> Any:
         return pa.array(array)
     array = array.astype(np.float64)
     if ((array == np.trunc(array)) | np.isnan(array)).all():
-        # pyarrow writes 1.0 as 1, and a column of those would read as an integer clock.
+        # pyarrow writes 1.0 as 1, and such a column would be read as an integer clock.
         return pa.array([None if x != x else repr(x) for x in array.tolist()], pa.string())
     return pa.array(array, from_pandas=True)  # a NaN becomes a null, which is an empty field
