@@ -260,7 +260,7 @@ class TestTheUnion:
         assert log_of(dataset)["left_out"]["without_rows"] == 1
         with pytest.raises(FileFormatError, match="there is no row to read"):
             assemble([Recording((signal([], []),))])
-        with pytest.raises(FileFormatError, match="nothing recorded"):
+        with pytest.raises(FileFormatError, match="no recordings"):
             assemble([])
 
     def test_names_and_units_must_agree(self):

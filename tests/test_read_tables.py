@@ -414,7 +414,7 @@ class TestNpz:
             ({"time": [0.0], "x": [1.0, 2.0]}, r"no array with a row for each of the \(1,\) times"),
             ({"time": ["noon"], "x": [1.0]}, "times of shape .* expected numbers"),
             ({"time": [0.0], "x": [1.0], "episode": [1, 2]}, "labels of shape"),
-            ({"time": np.zeros((2, 0)), "x": np.zeros((2, 0))}, "nothing recorded"),
+            ({"time": np.zeros((2, 0)), "x": np.zeros((2, 0))}, "no recordings"),
             ({"time": [0.0], "q": [[1.0, 2.0]], "q.0": [1.0]}, "two channels with the name 'q.0'"),
             ({"time": np.array(["2026-11-24", "NaT"], "M8[ns]"), "x": [1.0, 2.0]}, "time in row 1"),
         ],
