@@ -413,7 +413,7 @@ def test_a_backend_that_cannot_run_here_is_refused(monkeypatch: pytest.MonkeyPat
     with pytest.raises(ob.InputError, match="scan backend 'cuda'"), kernels.use("cuda"):
         pass
     monkeypatch.setenv("OFFBEAT_SCAN", "reference")
-    assert kernels.backend() == ("reference", "asked for by OFFBEAT_SCAN")
+    assert kernels.backend() == ("reference", "selected by OFFBEAT_SCAN")
     monkeypatch.setenv("OFFBEAT_SCAN", "avx2")
     monkeypatch.setattr(cpu, "instruction_sets", list)
     with pytest.raises(ob.InputError, match="was not built"):

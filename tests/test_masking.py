@@ -94,7 +94,7 @@ def test_dropout_keeps_exactly_the_asked_fraction_of_every_sensor(rows, percent,
     keep = [max(n * percent // 100, 1) for n in counts]
     too_short = any(-(-(n - k) // length) > k + 1 for n, k in zip(counts, keep, strict=True))
     if too_short:
-        with pytest.raises(InputError, match="lie apart"):
+        with pytest.raises(InputError, match="be apart"):
             mask_out(data, fraction, mask="dropout", burst_rows=length, seed=seed)
         return
     (one,) = mask_out(data, fraction, mask="dropout", burst_rows=length, seed=seed)

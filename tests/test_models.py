@@ -944,7 +944,7 @@ def test_an_unknown_model_is_refused_with_the_choices() -> None:
 
 def test_a_model_built_from_an_open_config_says_what_is_open() -> None:
     model = make_model("gru", dataset(2), **SMALL)
-    with pytest.raises(InputError, match="left open: hidden_size"):
+    with pytest.raises(InputError, match="not set: hidden_size"):
         Model(replace(model.config, hidden_size=None), model.data)
 
 

@@ -206,7 +206,7 @@ class TestDamage:
     def test_another_folder_is_no_data_set(self, tmp_path):
         (tmp_path / "x.txt").write_text("x")
         assert not lerobot.recognises(tmp_path)
-        refused(tmp_path, "no LeRobot data set, there is no meta/info.json")
+        refused(tmp_path, "not a LeRobot data set: there is no meta/info.json")
 
 
 def test_a_set_of_a_real_robot_is_read():

@@ -126,7 +126,7 @@ def test_the_topics_instances_and_fields_that_there_are_are_listed(write):
 def test_logged_dropouts_are_noted(write):
     note = one(write(dropouts={2: 30, 5: 112})).notes[0]
     assert note == (
-        "the autopilot logged 2 dropouts, 142 ms in all, the longest of 112 ms at 0.004 s"
+        "the autopilot logged 2 dropouts, 142 ms in total, the longest of 112 ms at 0.004 s"
     )
 
 

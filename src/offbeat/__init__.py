@@ -90,7 +90,7 @@ _PUBLIC = {
     "to_pandas": "data.frames",
     "windows": "data.windows",
 }
-"""Where the public names are defined."""
+"""Modules of the public names."""
 
 _FURTHER = {
     "BaseModel": "models.base",
@@ -116,7 +116,7 @@ _FURTHER = {
     "thesis_config": "models.zoo",
     "train_config": "models.zoo",
 }
-"""Where further names are defined, for code that composes its own protocol; not in `__all__`."""
+"""Modules of further names, for custom protocols; not in `__all__`."""
 
 _RENAMED = {
     "PartsConfig": "SplitConfig",
@@ -130,7 +130,7 @@ _RENAMED = {
     "thin": "mask_out",
     "write_report": "thesis.report.reproduction.write_report",
 }
-"""Names of 0.1.0, and what replaces them."""
+"""Names of 0.1.0 and their replacements."""
 
 __all__ = [
     "Batch",
@@ -185,7 +185,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Imports a public name when it is first asked for: `offbeat --help` needs no torch."""
+    """Imports a public name at its first use, so that `offbeat --help` does not import torch."""
     if name == "baselines":
         return importlib.import_module("offbeat.baselines")
     home = _PUBLIC.get(name) or _FURTHER.get(name)

@@ -1,4 +1,4 @@
-"""Baselines: simple predictors beside every fill and every forecast, with nothing to train."""
+"""Baselines: simple predictors of fills and forecasts, without training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Baseline:
         predict: (at, times, values, mean) to the values at the times `at`, from observations
             `values` at `times` (at least one) and the training mean of the channel. A causal
             baseline uses observations strictly before each of `at`.
-        causal: whether it uses the past alone.
+        causal: whether it uses only the past.
         fills: whether it is a baseline of fills.
         forecasts: whether it is a baseline of forecasts; it must be causal.
     """
@@ -61,16 +61,16 @@ def fill(trajectory: Trajectory, method: str, mean: Sequence[float]) -> Array:
       (`scipy.interpolate.PchipInterpolator`).
 
     The last two use the future; before the first observation and after the last they are constant.
-    Where a channel is never observed, all give the training mean.
+    For a channel that is never observed, all give the training mean.
 
     Args:
-        trajectory: what was observed.
+        trajectory: the observed trajectory.
         method: name of a baseline.
         mean: training mean of each channel, in its unit.
 
     Returns:
-        (rows, channels) in original units. At an observed row, an interpolation gives what was
-        observed, and a causal baseline what it predicts from the observations before.
+        (rows, channels) in original units. At an observed row, an interpolation gives the observed
+        value, and a causal baseline its prediction from earlier observations.
 
     Raises:
         InputError: there is no such baseline.
@@ -82,12 +82,12 @@ def forecast(trajectory: Trajectory, times: Array, method: str, mean: Sequence[f
     """Predicts after the last observation of each channel.
 
     - `last_value` repeats it.
-    - `constant_velocity` follows the straight line through the last two; with one, it repeats that.
+    - `constant_velocity` is the straight line through the last two; with one, it repeats that.
 
-    Where a channel is never observed, both give the training mean.
+    For a channel that is never observed, both give the training mean.
 
     Args:
-        trajectory: what was observed.
+        trajectory: the observed trajectory.
         times: (times,) s, after the last observation.
         method: name of a causal baseline.
         mean: training mean of each channel, in its unit.

@@ -1,4 +1,4 @@
-"""Configs: frozen records, free of torch, from which the command line is made."""
+"""Configs: frozen dataclasses without torch, which define the command line."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ Activation = Literal["tanh", "silu"]
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What a model consists of. A field left at None takes the value of the zoo's entry.
+    """Parts and options of a model. A field that is None takes the value of the zoo's entry.
 
     Attributes:
         name: id of the zoo's entry: `rnn`, `lstm`, `gru`, `rnn_decay`, `gru_d`, `neural_ode`,
             `ode_rnn`, `ode_gru_d`, `anchored_ode_gru_d`.
         hidden_size: units of the hidden state h.
-        head: how a state becomes a prediction, and its loss: `point`, the expected value and the
-            mean squared error; `gaussian`, a mean and a standard deviation and the negative
-            log-likelihood; or a head of one's own.
+        head: the map from a state to a prediction, and its loss: `point`, the expected value and
+            the mean squared error; `gaussian`, a mean and a standard deviation and the negative
+            log-likelihood; or a registered head.
         decoder_units: hidden layers of the head's decoder.
         cell: update at an observation. `gru` is equations 20-23, `elman` 6, `lstm` 14-19; `none`
-            leaves the state to the vector field. Or a cell of one's own.
+            for a vector field without a cell; or a registered cell.
         reset_after: GRU whose reset gate acts after the recurrent product, as in `torch.nn.GRU`,
             instead of before it, as in equation 22.
         vector_field: `mlp`, a neural ODE between observations (equation 36), `none`, or a vector
@@ -32,7 +32,7 @@ class ModelConfig:
         field_units: hidden layers of the vector field.
         activation: nonlinearity of the vector field.
         solver: how the vector field is integrated over a gap: `euler`, `midpoint`, `heun`, `rk4`,
-            `dopri5`, `tsit5`, or a tableau of one's own.
+            `dopri5`, `tsit5`, or a registered tableau.
         steps_per_gap: steps of a fixed-step solver over one gap.
         max_step: longest step of a fixed-step solver, in model time; each gap then takes as many
             equal steps as it needs, at least `steps_per_gap`.
@@ -40,33 +40,33 @@ class ModelConfig:
         atol: absolute tolerance of an adaptive solver, in units of the state.
         gradient: `backprop` through the solver's steps, or the `adjoint` method (algorithm 1).
         decay: `none`; `trainable`, the gamma_h of equation 26 from the times since observation of
-            all channels; `vector` or `scalar`, exp(-tau gap) with one tau per unit or one in all
+            all channels; `vector` or `scalar`, exp(-tau gap) with one tau per unit or a single one
             (equation 42).
-        decay_rows: `continuous`, the decay is a function of time alone, whatever rows it is asked
+        decay_rows: `continuous`, the decay is a function of time only, whatever the rows
             at; `every_row`, gamma compounds at every row (the thesis' protocol);
             `observed_rows`, the state decays only where it is updated.
         input_decay: gamma_x, last values that decay to the training mean (equation 27).
         anchored: the state holds the channels themselves, and an observation sets them.
         update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
-        time_input: the time that a plain cell is given: `elapsed` since the last observed row,
+        time_input: the time input of a cell without decay: `elapsed` since the last observed row,
             `delta` since each channel's last observation (equation 25), `gap` since the row before,
             or `none`.
         time_input_unit: of that time: the median `gap` of training, or the `longest` time met
             there, so that it is at most 1 in training. Times of many gaps are large beside the
             values, and can take longer to learn from.
-        self_feeding: fraction of rows at which the cell's input is the model's own decoded
+        self_feeding: fraction of rows at which the cell's input is the model's decoded
             prediction in place of the observed values (one draw per row for the whole batch,
             row 0 excepted), in training and in testing. Some public code does so by mistake.
-        readout: `target`, the state is moved to the time asked for; `last_row`, the prediction
+        readout: `target`, the state is propagated to the requested time; `last_row`, the prediction
             is decoded from the state after the row before (the thesis' protocol).
         init: `normal`, weights N(0, 0.1^2) and biases 0; `fan_in`, weights N(0, 1/fan-in), biases
             0, last layer of the vector field times 0.1.
         typical_gap: model time of the median training gap; fixes the unit of model time.
-        clock: when the state begins to move: at the `first_observation`, so that a prediction does
-            not depend on where a recording happens to begin, or at the `first_row`, observed or
+        clock: start of the model time: at the `first_observation`, so that a prediction does
+            not depend on the start of the recording, or at the `first_row`, observed or
             not (algorithms 2 and 3).
         gap_limit: time since the last observation saturates at this multiple of the longest one
-            met in training.
+            in training.
     """
 
     name: str = "anchored_ode_gru_d"
@@ -101,7 +101,7 @@ class ModelConfig:
     def __post_init__(self) -> None:
         for field_ in fields(self):
             value = getattr(self, field_.name)
-            if isinstance(value, list):  # as JSON and YAML give it
+            if isinstance(value, list):  # from JSON and YAML
                 object.__setattr__(self, field_.name, tuple(value))
         for name, choices in _CHOICES.items():
             if getattr(self, name) is not None:
@@ -126,7 +126,7 @@ class ModelConfig:
         if self.self_feeding and self.anchored:
             raise InputError(
                 "self_feeding is an option of the plain recurrent models; an anchored model "
-                "predicts from its own state anyway: leave self_feeding at 0"
+                "predicts from its own state: leave self_feeding at 0"
             )
 
 
@@ -145,34 +145,34 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 
 
 MASKS = ("rows", "values", "bursts", "dropout")
-"""Ways of masking observed values; `offbeat.data.masking.mask_out` says what each does."""
+"""Ways of masking observed values; see `offbeat.data.masking.mask_out`."""
 
 CUTS = ("one", "consecutive", "random")
-"""Ways of cutting windows; `offbeat.data.windows.windows` says what each does."""
+"""Ways of cutting windows; see `offbeat.data.windows.windows`."""
 
 SPLITS = ("trajectory", "time")
-"""Ways of splitting; `offbeat.data.splits.apply_split` says what each does."""
+"""Ways of splitting; see `offbeat.data.splits.apply_split`."""
 
 
 @dataclass(frozen=True)
 class SplitConfig:
-    """How recorded trajectories become a training, a validation and a test part.
+    """Options of windows, masks and the split into training, validation and test part.
 
     Attributes:
         window: rows of a window; None, and no window_s, keeps trajectories whole.
         window_s: length of a window in seconds, instead of in rows.
         cut: `one` window out of each trajectory, its start drawn; `consecutive`, one after the
-            other, nothing left out; `random`, drawn for training, consecutive for the other parts.
+            other; `random`, drawn for training, consecutive for the other parts.
             By default `one`, and `consecutive` where the split is by time.
         window_count: windows that `random` draws from each trajectory; by default as many as are
             as long as the trajectory together.
-        observed_fraction: fraction of what was observed that stays observed; None masks nothing.
+        observed_fraction: fraction of the observed values that stays observed; None masks nothing.
         mask: `rows`, all channels together at random; `values`, each channel on its own; `bursts`,
             runs of consecutive rows; `dropout`, runs of each sensor on its own.
         burst_rows: rows of a run; None, and no burst_s, makes it a single one.
         burst_s: length of a run in seconds, instead of in rows.
         sensors: channels that drop out together in `dropout`, a list of names per sensor; by
-            default channels that were always observed together.
+            default channels that are always observed together.
         by: split by `trajectory`, at random, or by `time`: the first rows train, those after them
             validate, the last ones test, and no window spans two parts.
         fractions: of the trajectories, or of the rows, for training, validation and test; they sum
@@ -216,7 +216,7 @@ class SplitConfig:
 
     @property
     def masking(self) -> dict[str, Any]:
-        """What `mask_out` is given beside the data and the seed."""
+        """The options of `mask_out`."""
         return {
             "observed_fraction": self.observed_fraction,
             "mask": self.mask,
@@ -228,7 +228,7 @@ class SplitConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How a model is trained. A field left at None takes the value of the model's recipe.
+    """Options of a training. A field that is None takes the value of the model's recipe.
 
     Attributes:
         epochs: passes over the training trajectories.
@@ -237,12 +237,12 @@ class TrainConfig:
         learning_rate: of the optimizer, at the start.
         schedule: `constant`, or `cosine` decay to zero over all steps.
         clip_norm: gradients are scaled down to this global norm; math.inf never does.
-        loss_scale: the loss is multiplied by this. Adam-like optimizers do not notice; `clip_norm`
-            does.
+        loss_scale: the loss is multiplied by this. Adam-like optimizers are invariant to it;
+            `clip_norm` is not.
         seed: of the order of the batches and of self-feeding.
-        patience: stop when the validation MSE has not improved for so many epochs; None never
-            stops early.
-        keep: weights that `fit` leaves in the model: of the `last` epoch, or of the `best`
+        patience: stop when the validation MSE has not improved for this number of epochs; None
+            never stops early.
+        keep: weights of the model after `fit`: of the `last` epoch, or of the `best`
             validation MSE; by default the best where there is a validation set.
         checkpoint_every: steps between checkpoints inside an epoch; None writes one at the end
             of each epoch only.
@@ -278,7 +278,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A `TrainConfig` with every choice made: how a model is trained.
+    """A `TrainConfig` with every field set.
 
     Attributes:
         epochs: as in `TrainConfig`, as are all others.
@@ -286,8 +286,8 @@ class Recipe:
         optimizer: name of the optimizer.
         learning_rate: at the start.
         schedule: of the learning rate.
-        keep: weights that `fit` leaves in the model.
-        clip_norm: largest norm of the gradients; None leaves them.
+        keep: weights of the model after `fit`.
+        clip_norm: largest norm of the gradients; None for no limit.
         loss_scale: factor of the loss.
         seed: of the order of the batches and of self-feeding.
         patience: epochs without improvement; None never stops early.
@@ -308,7 +308,7 @@ class Recipe:
 
 
 def check_seed(seed: int) -> int:
-    """Returns a seed that every generator takes.
+    """Checks and returns a seed.
 
     Raises:
         InputError: it is not an integer from 0 to 2**32 - 1.
@@ -331,7 +331,7 @@ def _check(config: Any, name: str, good: Any, expected: str) -> None:
 
 
 def from_mapping(cls: type[Any], values: dict[str, Any]) -> Any:
-    """Makes a config from a mapping, such as a JSON or YAML file gives.
+    """Makes a config from a mapping, such as from a JSON or YAML file.
 
     Raises:
         InputError: a key is not a field of the config; the message lists the fields.

@@ -1,4 +1,4 @@
-"""The demo: from simulation to a comparison of models in two minutes, all of it in files."""
+"""The demo: from simulation to a comparison of models in two minutes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FULL_STEPS = {**dict.fromkeys(THESIS_MODELS, 7000), ANCHORED: 2100}
 
 @dataclass(frozen=True)
 class Training:
-    """How one model was trained in the demo.
+    """The training of one model in the demo.
 
     Attributes:
         history: one record per epoch.
@@ -71,25 +71,25 @@ class Training:
 
     @property
     def under_trained(self) -> bool:
-        """True if it took fewer steps than a full-size run."""
+        """Whether it took fewer steps than a full-size run."""
         return self.steps < self.full_steps
 
     def note(self) -> str:
-        """The note at the end of a line of the table."""
+        """The note at the end of a row of the table."""
         took = f"{self.steps} of {self.full_steps} steps, {self.seconds:.0f} s"
         return f"under-trained: {took}" if self.under_trained else took
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo found and wrote. `print` shows it.
+    """Scores and files of the demo, shown by `print`.
 
     Attributes:
         folder: of all files.
         evaluation: every model and the last-value predictor on the test part.
         trainings: by model.
         written: files and folders, relative to `folder`, each with its description.
-        messages: what could not be done, and why.
+        messages: steps that could not be done, with reasons.
         seconds: wall time of this call.
     """
 
@@ -154,8 +154,8 @@ def run_demo(
 ) -> DemoResult:
     """Simulates a hopper, masks rows, trains five models, scores them and plots the results.
 
-    Training stops long before the models of the thesis converge; the result says so. A demo that
-    was stopped continues where it was. Results do not depend on `workers`.
+    Training stops long before the models of the thesis converge, which the result states. A demo
+    that was stopped is resumed. Results do not depend on `workers`.
 
     Args:
         out: folder to write to.
@@ -219,7 +219,7 @@ def run_demo(
         models = {name: load_model(jobs[name].folder) for name in FULL_STEPS}
         evaluation = evaluate(models, parts["test"], seed=seed)
         _write_scores(out, evaluation, trainings)
-        # Chosen by its clock, not by its errors: the window that begins soonest after the release.
+        # The window that starts soonest after the release, chosen without looking at errors.
         shown = min(parts["test"], key=lambda trajectory: float(trajectory.times[0]))
         _draw_curves(out, models, parts["validation"], trainings)
         _draw_predictions(out, models, shown)

@@ -1,4 +1,4 @@
-"""What is installed and what runs: the first place to look when something does not work."""
+"""Information on the installation, to diagnose problems."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def examine() -> dict[str, Any]:
 
 
 def dependencies() -> list[tuple[str, str]]:
-    """Every package that this one needs, each with the extra that brings it, or an empty string.
+    """Every dependency, with the extra that installs it, or an empty string.
 
-    They are those that the installed package declares; none where it runs without installation.
+    These are the dependencies of the installed package; none if it is not installed.
     """
     try:
         declared = importlib.metadata.requires("offbeat") or []

@@ -1,4 +1,4 @@
-"""The errors users meet. Every message says what it got, what was expected, and the fix."""
+"""Errors. Messages contain what was given, what was expected, and the fix."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from types import ModuleType
 
 
 class OffbeatError(Exception):
-    """Base of every error that Offbeat raises on purpose."""
+    """Base class of all errors of Offbeat."""
 
 
 class InputError(OffbeatError, ValueError):
-    """An argument, a config or an array is not what it must be."""
+    """An argument, a config or an array is invalid."""
 
 
 class FileFormatError(OffbeatError, ValueError):
-    """A file is truncated, damaged, or not of the format that was asked for."""
+    """A file is truncated, damaged, or not of the expected format."""
 
 
 class MissingExtraError(OffbeatError, ImportError):
-    """An optional dependency is not installed; the message names the extra that brings it."""
+    """An optional dependency is not installed; the message names the extra that installs it."""
 
 
 class DivergenceError(OffbeatError, ArithmeticError):
-    """A computation left the finite numbers: a loss turned to NaN, a solver ran out of steps."""
+    """A computation diverged: a loss is NaN, or a solver exceeded its number of steps."""
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Imports an optional dependency, or says in one line which extra brings it.
+    """Imports an optional dependency.
 
     Args:
         module: dotted name of the module to import.

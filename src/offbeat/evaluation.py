@@ -1,4 +1,4 @@
-"""Evaluation: models and the last value, scored in the same call on the same values."""
+"""Evaluation: scores of models and of the last value, on the same values."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Evaluation:
         scores: by predictor, in scaled units.
         names: channel names.
         units: channel units.
-        scaler: what the scaled units are: `standardise`, `divide_by_max`, ...
+        scaler: kind of the scaled units: `standardise`, `divide_by_max`, ...
         channel_scale: per channel, one scaled unit in the channel's unit.
-        trajectories: how many were scored.
-        channel_counts: per channel, how many values were scored.
+        trajectories: number of scored trajectories.
+        channel_counts: per channel, the number of scored values.
     """
 
     scores: Mapping[str, Scores]
@@ -86,7 +86,7 @@ def evaluate(
     """Scores one-step-ahead predictions of one or more models, and of the last observed value.
 
     Args:
-        models: one model, or several by name; several must share scaler and training means.
+        models: one model, or several by name; several must have the same scaler and training means.
         dataset: masked values that are known are scored too.
         seed: of self-feeding.
 
@@ -106,7 +106,7 @@ def evaluate(
         if not same:
             raise InputError(
                 f"{name!r} scores in other units than {next(iter(models))!r}: their scalers or "
-                "training means differ; train both on the same data, or evaluate them apart"
+                "training means differ; train both on the same data, or evaluate them separately"
             )
     batch = first.batch(dataset)
     counted = batch.targets & (last_index(batch.mask) >= 0)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written under a temporary name, then renamed."""
+"""Atomic files: written under a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from offbeat.errors import InputError
 
 
 def writable(path: str | Path, *, folder: bool = False) -> Path:
-    """Returns `path` if a file (or folder) can be written there; makes nothing yet.
+    """Returns `path` if a file (or folder) can be written there; creates nothing.
 
     Raises:
-        InputError: something on the way is no folder or may not be written to, or there is a folder
-            where a file is to be, or the other way round.
+        InputError: a parent is not a folder or is not writable, or there is a folder
+            in place of a file, or the other way round.
     """
     path = Path(path)
     if path.exists() and path.is_dir() != folder:
-        stands, wanted = ("file", "folder") if folder else ("folder", "file")
-        raise InputError(f"{path} is a {stands}; give the name of a {wanted}")
+        found, wanted = ("file", "folder") if folder else ("folder", "file")
+        raise InputError(f"{path} is a {found}; give the name of a {wanted}")
     nearest = next(parent for parent in path.absolute().parents if parent.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
         why = "may not be written to" if nearest.is_dir() else "is a file"
@@ -36,7 +36,7 @@ def writable(path: str | Path, *, folder: bool = False) -> Path:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yields a temporary file name beside `path`; renames it to `path` if the block succeeds.
 
-    A block that raises, or a process that is killed, leaves what was at `path` untouched.
+    If the block raises or the process is killed, `path` does not change.
     """
     path = writable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yields a temporary folder beside `path`; renames it to `path` if the block succeeds.
 
-    A folder at `path` is replaced, and only after the new one is complete.
+    A folder at `path` is replaced after the new one is complete.
     """
     path = writable(path, folder=True)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,7 +83,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 def _settle(path: Path) -> None:
-    """Waits until a file is on the disk, so that a power cut leaves no empty file of this name."""
+    """Flushes a file to the disk, so that a power failure leaves no empty file."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
@@ -95,5 +95,5 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Writes a JSON file atomically, keys in the given order, floats to the last bit."""
+    """Writes a JSON file atomically, keys in the given order, floats exactly."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")

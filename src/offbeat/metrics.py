@@ -1,9 +1,9 @@
-"""Scores of predictions against a batch: what counts, by name.
+"""Scores of predictions against a batch.
 
 `after_first_observation` is the default everywhere: it counts known values after the first
 observation of their channel, which is the honest choice, since before it every model can only
-predict the mean. `after_first_row` and `published` are given beside it because published numbers
-use them; `docs/deviations.md` says what they contain.
+predict the mean. `after_first_row` and `published` are given as well because published numbers
+use them; `docs/deviations.md` defines them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from offbeat.data.batch import Batch, delta, last_index, last_values
 from offbeat.tables import plain
 
 SCORINGS = ("after_first_observation", "masked", "after_first_row", "published")
-"""The scorings, always by these names."""
+"""Names of the scorings."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Score:
     """A mean squared error, in scaled units.
 
     Attributes:
-        mse: over all values that count; NaN when there is none.
+        mse: over all values that count; NaN if there are none.
         per_channel: the same per channel.
-        count: how many values counted.
+        count: number of values that count.
     """
 
     mse: float
@@ -47,8 +47,8 @@ class GapScore:
     """The score of values whose channel was last observed within a range of times.
 
     Attributes:
-        above: s, the time since observation is above this.
-        up_to: s, and at most this.
+        above: s, lower bound of the time since observation, exclusive.
+        up_to: s, upper bound, inclusive.
         score: of those values, after the first observation.
     """
 
@@ -99,7 +99,7 @@ def _plain(score: Score) -> dict[str, Any]:
 
 
 class ScoreSums:
-    """Adds up squared errors batch by batch, in float64.
+    """Accumulates squared errors over batches, in float64.
 
     Args:
         channels: number of channels.
@@ -117,7 +117,7 @@ class ScoreSums:
 
         Args:
             predictions: (batch, rows, channels) in the units of `batch.values`.
-            batch: what was observed and what is known.
+            batch: the observed and known values.
         """
         squared = (predictions.double() - batch.values.double()) ** 2
         known = batch.targets
@@ -144,7 +144,7 @@ class ScoreSums:
         self._sums[name] = (total, count)
 
     def scores(self) -> Scores:
-        """The scores of everything added so far."""
+        """The scores of all batches added so far."""
         unit = self.gap_unit or 0.0
         groups = sorted(k for k in self._sums if isinstance(k, int))
         by_gap = tuple(
@@ -177,7 +177,7 @@ def gap_groups(elapsed: Tensor, unit: float) -> Tensor:
 
 
 def last_value_predictions(batch: Batch, mean: Tensor) -> Tensor:
-    """The last-value predictor: repeat each channel's last observed value, the mean before any.
+    """The last-value predictor: repeats each channel's last observed value, at first the mean.
 
     Args:
         batch: scaled.
@@ -206,11 +206,11 @@ def _shown(rmse: float) -> str:
 
 
 def table(rows: Mapping[str, Scores], *, notes: Mapping[str, str] | None = None) -> str:
-    """A plain-text table of scores, one line per predictor, the best one first.
+    """A plain-text table of scores, one row per predictor, the best one first.
 
     Args:
         rows: scores by predictor.
-        notes: a remark per predictor, shown at the end of its line.
+        notes: a remark per predictor, shown at the end of its row.
     """
     notes = notes or {}
     lines = [["predictor", "RMSE", "masked only", "after row 0", "published", ""]]

@@ -49,10 +49,10 @@ __all__ = [
 
 
 def backend() -> tuple[str, str]:
-    """The variant of a backend that scans run in here where it supports them, and why.
+    """Returns the variant of the backend that scans run in, and the reason.
 
     Raises:
-        InputError: a backend is asked for that cannot run here.
+        InputError: the selected backend cannot run here.
     """
     choice = choose()
     return choice.variant, choice.reason
@@ -61,17 +61,17 @@ def backend() -> tuple[str, str]:
 def scan(
     spec: ScanSpec, parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Moves a batch of states over all steps, in the best backend that supports the spec.
+    """Propagates a batch of states over all steps, in the best backend that supports the spec.
 
     Args:
         spec: the shape of the scan.
-        parts: all that is trained in it.
-        inputs: what is given of each step.
+        parts: the trained parts.
+        inputs: the inputs of each step.
         state: (batch, state_size) before the first step.
 
     Returns:
-        Two tensors (batch, rows, state_size): the state that reaches each step, before anything is
-        observed there, and the state after the step.
+        Two tensors (batch, rows, state_size): the state before the observation of each step,
+        and the state after the step.
     """
     choice = choose(spec, state.dtype, state.device)
     found = choice.backend.scan(spec, parts, inputs, state, choice.variant)

@@ -1,7 +1,7 @@
 """Backends of the scan: a registry, and the choice among them.
 
-A backend is one module that registers what it supports and how it scans. `OFFBEAT_SCAN` in the
-environment, or `use`, names the one to take: `auto`, the name of a backend, or one of its variants.
+A backend is a module that registers its supported specs and its scan. `OFFBEAT_SCAN` in the
+environment, or `use`, selects one: `auto`, the name of a backend, or one of its variants.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ class Backend:
     """A way to run scans.
 
     Attributes:
-        name: what `OFFBEAT_SCAN` takes.
-        supports: (spec, dtype, device) to None, or to the reason why such scans cannot run.
+        name: value of `OFFBEAT_SCAN` that selects it.
+        supports: (spec, dtype, device) to None, or to the reason why it does not support them.
         scan: (spec, parts, inputs, state, variant) to the states before and after each step, or to
-            None where this very call cannot run although its spec is supported.
-        variants: names of its variants, such as instruction sets, which `OFFBEAT_SCAN` takes too.
-        available: those variants that run here, best first; nothing where the backend was not
-            built. A backend without variants gives its own name.
-        why_not: the reason where none is available.
-        perceptron: (layers, x, activation, variant) to the outputs, or to None where the call
+            None if this call cannot run although its spec is supported.
+        variants: names of its variants, such as instruction sets, for `OFFBEAT_SCAN`.
+        available: variants that run here, best first; empty if the backend was not
+            built. A backend without variants returns its own name.
+        why_not: the reason if none is available.
+        perceptron: (layers, x, activation, variant) to the outputs, or to None if the call
             cannot run; None for a backend without one.
-        training: a context in which a model is trained with this backend.
+        training: a context manager for training with this backend.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Backend:
 
 
 BACKENDS: Registry[Backend] = Registry("scan backend", group="offbeat.backends")
-"""Backends by name; `auto` takes the first that supports a scan, `reference` last."""
+"""Backends by name; `auto` selects the first that supports a scan, `reference` last."""
 
 REFERENCE = "reference"
 ALIASES = {"fused": "cpu"}
@@ -65,10 +65,10 @@ ALIASES = {"fused": "cpu"}
 
 
 def register_backend(backend: Backend, *, replace: bool = False) -> Backend:
-    """Adds a backend of the scan; returns it.
+    """Registers a backend of the scan; returns it.
 
     Args:
-        backend: tried by `auto` before those that were registered earlier.
+        backend: the backend; `auto` tries it before those registered earlier.
         replace: allow a name that is taken.
 
     Raises:
@@ -82,9 +82,9 @@ class Choice:
     """A backend for a spec.
 
     Attributes:
-        backend: that runs it.
+        backend: the backend.
         variant: of the backend.
-        reason: why this one.
+        reason: of the choice.
     """
 
     backend: Backend
@@ -100,7 +100,7 @@ def choose(
     dtype: torch.dtype = torch.float32,
     device: torch.device | None = None,
 ) -> Choice:
-    """The backend that scans of a spec run in here.
+    """Chooses the backend for scans of a spec.
 
     Args:
         spec: of the scan; by default any that all backends support.
@@ -108,7 +108,7 @@ def choose(
         device: of the state; by default the CPU.
 
     Raises:
-        InputError: a backend is asked for that cannot run here.
+        InputError: the selected backend cannot run here.
     """
     device = device or torch.device("cpu")
     name, where = _chosen.get(), "offbeat.kernels.use"
@@ -119,7 +119,7 @@ def choose(
     one_of("scan backend", name, ("auto", *BACKENDS, *named, *ALIASES))
     reference = BACKENDS[REFERENCE]
     if name == REFERENCE:
-        return Choice(reference, REFERENCE, f"asked for by {where}")
+        return Choice(reference, REFERENCE, f"selected by {where}")
     reasons = []
     if name == "auto":
         for backend in reversed(list(BACKENDS.values())):
@@ -129,13 +129,13 @@ def choose(
             if reason is None:
                 return Choice(backend, backend.runnable()[0], "the best that runs here")
             reasons.append(f"{backend.name}: {reason}")
-        return Choice(reference, REFERENCE, "; ".join(reasons) or "the only one there is")
+        return Choice(reference, REFERENCE, "; ".join(reasons) or "the only one")
     backend = named.get(name) or BACKENDS[name]
     runnable = backend.runnable()
     if not runnable:
         raise InputError(
             f"{where} asks for the scan backend {name!r}, but the backend {backend.name} was not "
-            f"built ({backend.why_not()}); install Offbeat where a C++ compiler is"
+            f"built ({backend.why_not()}); install Offbeat where a C++ compiler is available"
         )
     variant = name if name in named else runnable[0]
     if variant not in runnable:
@@ -145,7 +145,7 @@ def choose(
     reason = _why_not(backend, spec, dtype, device)
     if reason is not None:
         return Choice(reference, REFERENCE, f"{backend.name}: {reason}")
-    return Choice(backend, variant, f"asked for by {where}")
+    return Choice(backend, variant, f"selected by {where}")
 
 
 def _why_not(
@@ -158,7 +158,7 @@ def _why_not(
 
 @contextmanager
 def use(name: str) -> Iterator[str]:
-    """Runs scans in the named backend within a `with` block; yields the variant that runs.
+    """Context manager that runs scans in the named backend; yields the variant.
 
     Args:
         name: `auto`, a backend, or one of its variants.

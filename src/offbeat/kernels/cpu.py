@@ -1,10 +1,10 @@
 """The compiled backend of the scan: all steps, forward and backward, in one call of C++.
 
 The compiled module has code for several instruction sets and runs the best that the processor has.
-Blocks of trajectories run through all steps by themselves, spread over `torch.get_num_threads()`
-threads; the result does not depend on how many, bit for bit. A trajectory's result depends neither
-on its batch mates nor on its place in the batch, and the steps of a stream give the bits of a
-batch.
+Blocks of trajectories run independently, on `torch.get_num_threads()`
+threads; the result does not depend on the number of threads. A trajectory's result depends neither
+on other trajectories nor on its position in the batch, and the steps of a stream equal those of a
+batch bit for bit.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ rest, a few rows at a time (`benchmarks/scaling.py` measures the cost)."""
 
 ROWS_AT_ONCE = 0
 """Rows whose weight gradients are added together; 0 for as many as have eight evaluations of the
-vector field (`benchmarks/scaling.py` measures others). It does not change the bits: the order of
+vector field (`benchmarks/scaling.py` measures others). It does not change the result: the order of
 each sum is fixed."""
 
 _CELLS = {"none": 0, "start": 1, "elman": 2, "lstm": 3, "gru": 4}
@@ -60,17 +60,17 @@ _threads: ContextVar[int | None] = ContextVar("offbeat_threads", default=None)
 
 
 def threads() -> int:
-    """Threads of the compiled code: as many as torch has, or as `own_threads` found it to have."""
+    """Number of threads of the compiled code: that of torch, also inside `own_threads`."""
     own = _threads.get()
     return torch.get_num_threads() if own is None else own
 
 
 @contextmanager
 def own_threads() -> Iterator[None]:
-    """Gives torch's threads to the compiled code within a `with` block, and leaves torch one.
+    """Context manager that gives torch's threads to the compiled code, and leaves one to torch.
 
-    Torch's idle threads spin for a while before they sleep, on the very cores that the scan is
-    about to use, and what torch has to do beside the scan is too small to be worth a second thread.
+    Torch's idle threads spin before they sleep, on the cores that the scan
+    uses, and torch's other work is too small for a second thread.
     """
     count = torch.get_num_threads()
     if compiled is None or count == 1:
@@ -91,12 +91,12 @@ def instruction_sets() -> list[str]:
 
 
 def suffix(dtype: torch.dtype) -> str:
-    """What the compiled module calls a type."""
+    """Suffix of a dtype in names of the compiled module."""
     return _TYPES[dtype]
 
 
 def supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | None:
-    """None where this backend runs scans of a spec, else the reason why not."""
+    """None if this backend runs scans of a spec, else the reason why not."""
     if compiled is None:
         return f"it was not built ({why_not})"
     if spec.cell not in _CELLS:
@@ -117,7 +117,7 @@ def supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | 
 def unsupported(
     spec: ScanSpec, parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor
 ) -> str | None:
-    """None where the compiled backend runs a scan, else the reason why not."""
+    """None if the compiled backend runs a scan, else the reason why not."""
     if reason := supports(spec, state.dtype, state.device):
         return reason
     trained, given = tuple(parts.tensors()), tuple(inputs.known())
@@ -137,7 +137,7 @@ def scan(
     state: Tensor,
     variant: str | None = None,
 ) -> tuple[Tensor, Tensor] | None:
-    """Moves a batch of states over all steps, as `offbeat.kernels.scan`.
+    """Propagates a batch of states over all steps; see `offbeat.kernels.scan`.
 
     Args:
         spec: see there.
@@ -188,7 +188,7 @@ def compiled_spec(spec: ScanSpec) -> Any:
 
 
 def _array(tensor: Tensor | None) -> Any:
-    """A view that the compiled module takes without a copy; its last axis lies in one piece."""
+    """A view that the compiled module takes without a copy; its last axis is contiguous."""
     if tensor is None:
         return None
     if tensor.ndim and tensor.shape[-1] > 1 and tensor.stride(-1) != 1:
@@ -242,7 +242,7 @@ class _Scan(Function):
             _array(tape), ctx.threads,
         )  # fmt: skip
         ctx.own, ctx.inputs, ctx.variant, ctx.rows = own, inputs, variant, rows
-        # What is returned must be kept this way: as attributes it would never be freed.
+        # Outputs must be saved in this way: as attributes they would never be freed.
         ctx.save_for_backward(packed, state, after, tape)
         ctx.set_materialize_grads(False)
         return before, after
@@ -274,7 +274,7 @@ class _Scan(Function):
 
 
 def perceptron(layers: Layers, x: Tensor, activation: str, variant: str | None = None) -> Tensor:
-    """Applies a perceptron to (..., inputs); a row's result depends on that row alone, bit for bit.
+    """Applies a perceptron to (..., inputs); a row's result depends only on that row, bit for bit.
 
     Args:
         layers: weights and biases.

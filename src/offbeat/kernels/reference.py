@@ -30,7 +30,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"tanh": torch.tanh, "silu"
 def scan(
     spec: ScanSpec, parts: ScanParts, inputs: StepInputs, state: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Moves a batch of states over all steps; every combination, as `offbeat.kernels.scan`."""
+    """Propagates a batch of states over all steps, for any spec; see `offbeat.kernels.scan`."""
     before: list[Tensor] = []
     after: list[Tensor] = []
     decays = _decays(spec, parts, inputs)
@@ -95,7 +95,7 @@ def _input(inputs: StepInputs, shown: Tensor, at: slice | int) -> Tensor:
 
 
 def _decayed(parts: ScanParts, inputs: StepInputs) -> Tensor:
-    """x-hat of equation 27: the observed value, or what is left of the last one."""
+    """x-hat of equation 27: the observed value, or the decayed last one."""
     if parts.input_decay is None:
         raise ValueError("input_decay needs ScanParts.input_decay")
     weight, bias = parts.input_decay
@@ -123,11 +123,11 @@ class DecayAlongGap:
 
 
 Decay = Tensor | DecayAlongGap | None
-"""Of one row: the factor of h, or the exponents where they act step by step, or nothing."""
+"""Decay of a row: the factor of h, or exponents that are applied in each solver step, or None."""
 
 
 def _decays(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Sequence[Decay]:
-    """The decay of each row; where it acts at once, the factors of all rows in one go."""
+    """The decay of each row; factors are computed for all rows at once."""
     if not spec.decay:
         return [None] * inputs.rows
     if parts.decay is None:
@@ -138,7 +138,7 @@ def _decays(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Sequence[De
         fresh = _given(inputs.updated)[..., None] > 0
         applied = torch.where(fresh, 0.0, start.clamp(0.0, LARGEST_EXPONENT))
     else:
-        # The whole exponent again: at each step it compounds over unobserved ones.
+        # The whole exponent at each step: it compounds over unobserved ones.
         if spec.decay_rows == "observed_rows":
             end = end * inputs.update[..., None]
         start, applied = end, torch.zeros_like(end)
@@ -153,7 +153,7 @@ def _decays(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Sequence[De
 
 def _given(tensor: Tensor | None) -> Tensor:
     if tensor is None:
-        raise ValueError("the scan's inputs or parts lack what its spec asks for")
+        raise ValueError("the scan's inputs or parts lack a tensor that its spec needs")
     return tensor
 
 
@@ -172,7 +172,7 @@ def _fed_gate(
 def _propagate(
     spec: ScanSpec, parts: ScanParts, gap: Tensor, decay: Decay, state: Tensor
 ) -> Tensor:
-    """Decay and dynamics of (x, h) over one gap; the memory of a cell stays."""
+    """Decay and dynamics of (x, h) over one gap; the memory of a cell does not change."""
     if isinstance(decay, Tensor):
         state = _scale_hidden(spec, state, decay)
         decay = None
@@ -230,7 +230,7 @@ def _solve_split(
     state: Tensor,
     steps: int | Tensor,
 ) -> Tensor:
-    """Equal steps; the decay of each step comes before it (Lie splitting).
+    """Equal steps, each after its decay (Lie splitting).
 
     With one step per gap and every row observed this is algorithm 3 of the thesis.
     """
@@ -256,12 +256,12 @@ def _solve_damped(
     decay: DecayAlongGap,
     state: Tensor,
 ) -> Tensor:
-    """The limit of ever shorter split steps, adaptive: h = exp(-E(s)) u, solved for u."""
+    """The limit of short split steps, adaptive: h = exp(-E(s)) u, solved for u."""
     start, end, applied = decay.start, decay.end, decay.applied
     state = _scale_hidden(spec, state, torch.exp(-_growth(start, applied)))
 
     def exponent(s: Tensor) -> Tensor:
-        # From `start` itself: the adjoint knows the tensors it is given, not what was made of them.
+        # From `start` itself: the adjoint takes gradients for the tensors that it is given.
         return _growth(start + s * (end - start), _exponent(start))
 
     def damped_field(s: Tensor, u: Tensor) -> Tensor:
@@ -289,15 +289,15 @@ def _exponent(a: Tensor) -> Tensor:
 
 
 def _growth(a: Tensor, applied: Tensor) -> Tensor:
-    """How far A has grown past what has been applied to the state; never less than 0.
+    """The growth of A beyond the part applied to the state; at least 0.
 
-    A decay only ever shrinks: a state that the flow has meanwhile moved is not blown up again.
+    A decay never increases the state, even if the flow changes it in between.
     """
     return (_exponent(a) - applied).clamp_min(0.0)
 
 
 def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
-    """Multiplies h, and leaves x and c."""
+    """Multiplies h by a factor; does not change x and c."""
     if factor.shape == state.shape:
         return state * factor
     first, last = spec.anchors, spec.anchors + spec.hidden_size
@@ -316,7 +316,7 @@ def _update(
     observed: tuple[Tensor, Tensor] | None,
     state: Tensor,
 ) -> Tensor:
-    """The state after an observation; of an anchored one, x takes the observed values."""
+    """The state after an observation; x of an anchored state takes the observed values."""
     if observed is None:
         return cell.step(gate, state, update)
     x, rest = state[:, : spec.anchors], state[:, spec.anchors :]

@@ -1,9 +1,9 @@
-"""What a scan consists of: its shape, its trained parts, and the inputs of each step.
+"""The definition of a scan: its shape, its trained parts, and the inputs of each step.
 
-A scan moves a state over time steps. The inputs of a step (`StepInputs`) follow from times, masks
-and values alone. They do not depend on trained parameters, so they are computed once per data set.
-Everything that a parameter touches happens inside the scan: what does not depend on the state (the
-projection of the inputs, decay exponents, x-hat), and what does (innovation, self-feeding, vector
+A scan propagates a state over time steps. The inputs of a step (`StepInputs`) depend on times,
+masks and values only. They do not depend on trained parameters, so they are computed once per data
+set. All computations with parameters are inside the scan: those independent of the state (the
+projection of the inputs, decay exponents, x-hat), and the others (innovation, self-feeding, vector
 field, recurrent product).
 
 The state of one trajectory is `[x | h | c]`: `anchored` channels, `hidden_size` hidden units, and
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 LARGEST_EXPONENT = 30.0
-"""Decay exponents end here: exp(-30) is nothing beside any state, and exp(30) is still finite."""
+"""Upper bound of decay exponents: exp(-30) is negligible, and exp(30) is finite."""
 
 
 @dataclass(frozen=True)
@@ -33,26 +33,26 @@ class ScanSpec:
         hidden_size: units of h.
         cell: name of the cell in `parts.CELLS`, such as `gru`; `none` without one.
         gates: width of the cell's input projection.
-        memory: units of c, beside those of h.
+        memory: units of c.
         anchored: the channels are part of the state, and an observation sets them.
         reset_after: the GRU's reset gate acts after the recurrent product.
         time_inputs: width of the times since observation that the cell is given; 0 for none.
         field: units of each layer of a perceptron vector field, ends included. A field of another
-            kind has its name in `field_kind`, and here its ends alone. Empty without a field.
+            kind has its name in `field_kind`, and here only its ends. Empty without a field.
         field_kind: name of the vector field in `parts.FIELDS`.
         activation: nonlinearity between the layers of the vector field.
         solver: name of a tableau.
-        steps_per_gap: least number of equal steps of a fixed-step solver over one gap.
+        steps_per_gap: minimum number of equal steps of a fixed-step solver over one gap.
         max_step: longest such step, model time; None for no bound.
-        most_steps: a bound on the steps of `max_step`, where the scan is traced; the reference
-            backend takes so many, of which the last ones have length 0.
+        most_steps: a bound on the steps of `max_step` for tracing; the reference
+            backend takes this number of steps, the last ones of length 0.
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver.
         adjoint: gradients of the vector field's solution by the adjoint method.
-        decay: width of what the decay of h is computed from: 0 without one, else the times since
+        decay: width of the inputs of the decay of h: 0 without one, else the times since
             observation of all channels (equation 26) or one elapsed time (equation 42).
         decay_rows: meaning of a step in which nothing is observed: `continuous`, the exponent grows
-            along time; `every_row`, it acts again at each step; `observed_rows`, only where the
+            with time; `every_row`, it is applied at each step; `observed_rows`, only where the
             cell acts.
         input_decay: last values decay to the mean (equation 27).
         decoder: units of each layer of the decoder, ends included, with self-feeding only.
@@ -97,14 +97,14 @@ Layers = tuple[tuple[Tensor, Tensor], ...]
 
 
 class ScanCell(Protocol):
-    """What a scan needs of a cell; `parts.cells.Cell` is the base class that has it."""
+    """Interface of a cell in a scan; `parts.cells.Cell` is the base class."""
 
     @property
     def innovation(self) -> Tensor | None:
         """(gates, channels) weights of the innovation of an anchored state, or None."""
 
     def project(self, inputs: Tensor) -> Tensor:
-        """(..., inputs) to (..., gates): all that does not depend on the state."""
+        """(..., inputs) to (..., gates): the part that does not depend on the state."""
 
     def step(self, gates: Tensor, state: Tensor, update: Tensor) -> Tensor:
         """The new (h, c) of each row where `update` is 1, exactly the old one where it is 0."""
@@ -114,7 +114,7 @@ class ScanCell(Protocol):
 
 
 class ScanField(Protocol):
-    """What a scan needs of a vector field."""
+    """Interface of a vector field in a scan."""
 
     def __call__(self, state: Tensor) -> Tensor:
         """(..., state) to its derivative, of the same shape."""
@@ -128,7 +128,7 @@ class ScanParts:
     """The trained parts of a scan.
 
     Attributes:
-        cell: what an observation does to h; None without one.
+        cell: update of h by an observation; None without one.
         decay: weight (hidden, decay) and bias (hidden,) of the exponents, or None.
         input_decay: weight (channels,) and bias (channels,) of gamma_x, or None.
         field: the vector field, or None.
@@ -180,12 +180,12 @@ QUANTITIES = (
     "delta",
     "last",
 )
-"""What can be given of each step of each trajectory, in the order of the compiled code."""
+"""Names of the step inputs, in the order of the compiled code."""
 
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """What is given of each step; it does not depend on trained parameters.
+    """The inputs of each step, which do not depend on trained parameters.
 
     Attributes:
         gap: (batch, rows) model time since the step before, saturated.
@@ -194,14 +194,14 @@ class StepInputs:
         mask: (batch, rows, channels) 1.0 where observed, else 0.0.
         time_input: (batch, rows, time_inputs) times since observation for the cell, or None.
         updated: (batch, rows) 1.0 where the cell acted at the step before; with a decay only.
-        decay_start: (batch, rows, decay) what the decay is computed from, at the start of the gap.
+        decay_start: (batch, rows, decay) inputs of the decay at the start of the gap.
         decay_end: (batch, rows, decay) the same at its end.
         delta: (batch, rows, channels) model time since each channel's last observation, with
             `input_decay` only.
         last: (batch, rows, channels) last value of each channel; with `input_decay` only.
-        mean: (channels,) what a value decays to; with `input_decay` only.
-        length: (batch,) int64, rows of each trajectory; later rows are padding and leave the state
-            as it is. None: all rows count.
+        mean: (channels,) value that last values decay to; with `input_decay` only.
+        length: (batch,) int64, rows of each trajectory; later rows are padding and do not change
+            the state. None: all rows count.
         fed: one bool per row, True where the decoded state replaces the observed values; with
             self-feeding only.
     """
@@ -229,11 +229,11 @@ class StepInputs:
         return self.gap.shape[1]
 
     def gathered(self) -> StepInputs:
-        """These inputs; `TableSteps` has them in a table."""
+        """Returns these inputs; `TableSteps` gathers them from a table."""
         return self
 
     def known(self) -> Iterator[Tensor]:
-        """All tensors of numbers that there are."""
+        """All tensors of numbers that are present."""
         for name in QUANTITIES:
             if (tensor := getattr(self, name)) is not None:
                 yield tensor
@@ -244,8 +244,8 @@ class StepTable:
     """The step inputs of many trajectories in one tensor, so that a batch is one gather.
 
     Attributes:
-        table: (trajectories, rows, columns), the columns in one piece.
-        places: of each input: its name, its columns, and whether it has an axis of units.
+        table: (trajectories, rows, columns), with contiguous columns.
+        places: per input, its name, its columns, and whether it has an axis of units.
         mean: as `StepInputs.mean`.
         length: as `StepInputs.length`.
     """
@@ -257,7 +257,7 @@ class StepTable:
 
     @classmethod
     def of(cls, rows: StepInputs) -> StepTable:
-        """Puts step inputs side by side.
+        """Concatenates step inputs.
 
         Args:
             rows: of all trajectories.
@@ -280,7 +280,7 @@ class StepTable:
 
     @cached_property
     def columns(self) -> tuple[tuple[int, int], ...]:
-        """First column and number of columns of each of `QUANTITIES`; of what is missing, none."""
+        """First column and number of columns of each of `QUANTITIES`; 0 if missing."""
         where = {name: (at.start, at.stop - at.start) for name, at, _ in self.places}
         return tuple(where.get(name, (0, 0)) for name in QUANTITIES)
 
@@ -298,10 +298,10 @@ class StepTable:
 
 @dataclass(frozen=True, eq=False)
 class TableSteps:
-    """Step inputs in a table: a compiled backend reads them there, others gather them.
+    """Step inputs in a table, which a compiled backend reads directly and others gather.
 
     Attributes:
-        table: has the rows.
+        table: the table.
         index: (batch,) positions of the trajectories in it, int64.
         rows: of the longest of them.
         length: (batch,) as `StepInputs.length`.
@@ -318,7 +318,7 @@ class TableSteps:
         return len(self.index)
 
     def gathered(self) -> StepInputs:
-        """The rows, side by side."""
+        """Gathers the rows."""
         table = self.table.table[:, : self.rows].index_select(0, self.index)
         given: dict[str, Any] = {
             name: table[..., at] if units else table[..., at.start]
@@ -327,5 +327,5 @@ class TableSteps:
         return StepInputs(**given, mean=self.table.mean, length=self.length, fed=self.fed)
 
     def known(self) -> Iterator[Tensor]:
-        """All tensors of numbers that there are."""
+        """All tensors of numbers that are present."""
         yield self.table.table

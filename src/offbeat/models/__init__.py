@@ -1,1 +1,1 @@
-"""Models: parts around one recurrence, the zoo that names their combinations, checkpoints."""
+"""Models: a recurrence composed of parts, the zoo of combinations, and checkpoints."""

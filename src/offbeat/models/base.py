@@ -1,4 +1,4 @@
-"""What every model has: the data it was made for, batches of it, predictions and a loss."""
+"""The base class of models: batches of their data, predictions and a loss."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from offbeat.parts.heads import Prediction
 
 @dataclass(frozen=True, eq=False)
 class DataInfo:
-    """What a model knows of the data it was made for; saved with it.
+    """Properties of the data that a model is made for; saved with it.
 
     Attributes:
         names: channel names, which data must match.
@@ -30,7 +30,7 @@ class DataInfo:
         roles: per channel `state`, `action` or `exogenous`.
         scaler: maps original units to the scaled ones that the model works in.
         statistics: measured on the training set.
-        transforms: what the data went through before a model sees it.
+        transforms: input transforms of the data.
     """
 
     names: tuple[str, ...]
@@ -47,7 +47,7 @@ class DataInfo:
 
 
 class Prepared(Sized, Protocol):
-    """A data set in the form that `BaseModel.run` takes, a part at a time."""
+    """A data set in the form that `BaseModel.run` takes, or parts of it."""
 
     def take(self, index: Tensor) -> Any:
         """Some trajectories.
@@ -58,13 +58,13 @@ class Prepared(Sized, Protocol):
 
 
 class BaseModel(nn.Module):
-    """Base class of models: what fitting, scoring and answering need of one.
+    """Base class of models: the interface for fitting, scoring and predicting.
 
-    A subclass defines `prepare` and `run`, or `forward` alone.
+    A subclass defines `prepare` and `run`, or only `forward`.
 
     Args:
-        name: shown in tables, and the name of its registry entry.
-        data: what it was made for.
+        name: of its registry entry, shown in tables.
+        data: properties of the data that it is made for.
     """
 
     mean: Tensor
@@ -81,12 +81,12 @@ class BaseModel(nn.Module):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the trained parameters."""
+        """That of the trained parameters."""
         return self.mean.dtype
 
     @property
     def device(self) -> torch.device:
-        """Of the trained parameters."""
+        """That of the trained parameters."""
         return self.mean.device
 
     @property
@@ -97,7 +97,7 @@ class BaseModel(nn.Module):
     def batch(self, dataset: Dataset) -> Batch:
         """Transforms, scales and pads a data set of this model's channels, in any order.
 
-        Actions that the model does not know are left out.
+        Actions that the model does not have are left out.
 
         Returns:
             The batch, on the model's device.
@@ -120,7 +120,7 @@ class BaseModel(nn.Module):
         return batch.to(self.device)
 
     def prepare(self, batch: Batch) -> Prepared:
-        """What `run` takes of a batch, computed once for a data set.
+        """Computes the input of `run` from a batch, once per data set.
 
         Args:
             batch: scaled.
@@ -128,7 +128,7 @@ class BaseModel(nn.Module):
         return batch
 
     def run(self, prepared: Any, *, generator: torch.Generator | None = None) -> Prediction:
-        """Predicts every row of prepared data from what was observed before it.
+        """Predicts every row of prepared data from earlier observations.
 
         Args:
             prepared: from `prepare`, whole or some trajectories of it.
@@ -145,18 +145,18 @@ class BaseModel(nn.Module):
         return (squared * mask).sum() / mask.sum().clamp_min(1)
 
     def backend(self) -> tuple[str, str]:
-        """What runs this model here, and why."""
-        return "torch", "a model of its own"
+        """The backend that runs this model, and the reason."""
+        return "torch", "a registered module"
 
     def threads(self) -> AbstractContextManager[None]:
-        """A context in which the threads go to what does the work of training this model."""
+        """A context manager that assigns the threads for training this model."""
         return nullcontext()
 
     def save(self, path: str | Path) -> None:
         """Writes the model to a folder, atomically: `model.safetensors` and `config.json`.
 
         Args:
-            path: the folder; one that is there is replaced.
+            path: the folder; an existing one is replaced.
         """
         from offbeat.models.checkpoint import save_model
 
@@ -164,7 +164,7 @@ class BaseModel(nn.Module):
 
 
 def _difference(own: dict[str, str], given: dict[str, str]) -> str:
-    """What to change in the data for it to have the channels of the model."""
+    """The differences between the channels of the data and of the model."""
     units = (
         f"{name} is in {given[name]}, not {unit}"
         for name, unit in own.items()

@@ -41,17 +41,17 @@ def save_model(model: BaseModel, path: str | Path) -> None:
 
 
 def load_model(path: str | Path) -> Any:
-    """Reads a model back: the same predictions, bit for bit.
+    """Reads a model, which gives the same predictions bit for bit.
 
     Args:
-        path: the folder of a checkpoint, that of an unfinished training, or of a run
+        path: the folder of a checkpoint, of an unfinished training, or of a run
             that `fit` wrote.
 
     Returns:
         A `Model`, or a `ForeignModel`.
 
     Raises:
-        FileFormatError: the folder is missing, damaged by as little as one byte, not a checkpoint,
+        FileFormatError: the folder is missing, damaged, not a checkpoint,
             or of a newer version.
         InputError: it is a model of another package, which has not been registered.
     """
@@ -78,10 +78,10 @@ def load_model(path: str | Path) -> Any:
 def save_training_state(
     model: BaseModel, tensors: dict[str, Tensor], record: dict[str, Any], path: str | Path
 ) -> None:
-    """Writes a model with all that its training needs to be resumed.
+    """Writes a model with the state of its training, to resume it.
 
     Args:
-        model: in its present state.
+        model: in its current state.
         tensors: of the optimizer, and best weights.
         record: JSON-like counters and history.
         path: the folder.
@@ -93,7 +93,7 @@ def save_training_state(
 def load_training_state(
     path: str | Path,
 ) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Any]]:
-    """Reads what `save_training_state` wrote: weights, training tensors, record.
+    """Reads the state of a training: weights, training tensors, record.
 
     Raises:
         FileFormatError: as `load_model`.
@@ -151,7 +151,7 @@ _RENAMED = {"age_input": "time_input", "age_unit": "time_input_unit"}
 
 
 def _of_version_1(record: dict[str, Any]) -> dict[str, Any]:
-    """A record of version 1 in the form of version 2."""
+    """Converts a record of version 1 to version 2."""
     config = {_RENAMED.get(key, key): value for key, value in record["model"].items()}
     return {
         **record,

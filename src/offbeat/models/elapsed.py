@@ -1,6 +1,6 @@
-"""Times since observation and gaps at every row, and the state that is kept for later rows.
+"""Times since observation and gaps at every row, and the recurrent state.
 
-By default nothing moves before the first observation: the model's clock starts there. After it,
+By default the model's clock starts at the first observation. After it,
 time since the last observed row saturates at a limit, and a gap is the growth of that saturated
 time. So rows in which nothing is observed can be inserted anywhere without effect.
 """
@@ -17,7 +17,7 @@ from offbeat.data.batch import Batch, last_index
 
 @dataclass(frozen=True, eq=False)
 class RecurrentState:
-    """Everything a model keeps of the rows it has seen.
+    """The state of a model after the rows it has processed.
 
     Attributes:
         state: (batch, state_size).
@@ -27,7 +27,7 @@ class RecurrentState:
         channel_at: (batch, channels) float64, s, of each channel's last observation; -inf before.
         last: (batch, channels) last observed value of each channel; the training mean before.
         updated: (batch,) bool, True if the cell acted at the last row.
-        rows: number of rows seen.
+        rows: number of processed rows.
         generator: of self-feeding, or None.
         actions: (batch, channels) values of the last row in channels with the role `action`, NaN
             elsewhere and where there was none; None for a model without such channels.
@@ -48,11 +48,11 @@ class RecurrentState:
     def empty(
         cls, state: Tensor, mean: Tensor, *, generator: torch.Generator | None = None
     ) -> RecurrentState:
-        """Nothing seen yet.
+        """The state before the first row.
 
         Args:
             state: (batch, state_size) the state before anything is observed.
-            mean: (channels,) in place of a value never observed.
+            mean: (channels,) values before the first observation.
             generator: of self-feeding.
         """
         batch, device = len(state), state.device
@@ -75,14 +75,15 @@ class RecurrentState:
 
 @dataclass(frozen=True, eq=False)
 class ElapsedTimes:
-    """What follows from times and masks alone; all times in s, float64.
+    """Elapsed times, from times and masks; all in s, float64.
 
     Attributes:
         observed: (batch, rows) bool, True where any channel is observed.
         first: (batch, rows) bool, True at the first observed row.
         step: (batch, rows) since the row before, in the data.
         gap: (batch, rows) growth of the saturated time since the last observed row.
-        elapsed: (batch, rows) saturated time since the last observed row, on arrival at the row.
+        elapsed: (batch, rows) saturated time since the last observed row, before the row's
+            observation.
         elapsed_before: (batch, rows) the same at the row before, after its observation.
         delta: (batch, rows, channels) time since each channel's last observation (equation 25) on
             arrival; over a gap it
@@ -109,11 +110,11 @@ def elapsed_times(
     elapsed_limit: float,
     from_first_row: bool = False,
 ) -> tuple[ElapsedTimes, RecurrentState]:
-    """Times at each row of a batch that continues what `past` has seen.
+    """Computes the times at each row of a batch that continues `past`.
 
     Args:
         batch: rows to come, in order.
-        past: what was seen before; its `state`, `updated` and `actions` are passed on.
+        past: state after the earlier rows; its `state`, `updated` and `actions` are kept.
         elapsed_limit: s, at which the time since the last observed row saturates.
         from_first_row: the clock starts at the first row, observed or not.
     """
@@ -166,7 +167,7 @@ def elapsed_times(
 
 
 def _saturate(elapsed: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Time that counts, from 0 to the limit, and the time beyond the limit that does not."""
+    """Splits elapsed time into the part up to the limit, and the rest."""
     elapsed = elapsed.clamp_min(0)
     counted = elapsed.clamp_max(limit)
     return counted, elapsed - counted

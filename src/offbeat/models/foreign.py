@@ -1,4 +1,4 @@
-"""Models of one's own: any module with `forward(batch) -> Prediction`, trained and scored as ours.
+"""Registered modules: any module with `forward(batch) -> Prediction` as a model.
 
 class Window(torch.nn.Module):
     def __init__(self, data, width=32): ...
@@ -22,15 +22,15 @@ from offbeat.parts.heads import Prediction
 
 
 class ForeignModel(BaseModel):
-    """A module of one's own, and the data it was made for.
+    """A registered module, and the data it is made for.
 
     Args:
         name: of its registry entry.
-        module: its `forward` takes a scaled `Batch` and gives a `Prediction` of its rows, each from
-            what was observed before it. A method `loss(prediction, target, mask)` of the module
+        module: its `forward` takes a scaled `Batch` and returns a `Prediction` of its rows, each
+            from earlier observations. A method `loss(prediction, target, mask)` of the module
             replaces the mean squared error.
-        data: what it was made for.
-        options: JSON-like arguments that it was made with, saved with it.
+        data: properties of the data that it is made for.
+        options: JSON-like arguments of its factory, saved with it.
     """
 
     def __init__(
@@ -46,14 +46,14 @@ class ForeignModel(BaseModel):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the module's parameters; float32 where it has none."""
+        """Dtype of the module's parameters; float32 if it has none."""
         return next((p.dtype for p in self.module.parameters()), self.mean.dtype)
 
     def forward(self, batch: Batch) -> Prediction:
         """The module's prediction.
 
         Raises:
-            InputError: it is none, or of another shape than the batch.
+            InputError: it is not a prediction, or its shape differs from the batch.
         """
         found = self.module(batch)
         mean = getattr(found, "mean", None)

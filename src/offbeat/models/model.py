@@ -2,7 +2,7 @@
 
     decay -> dynamics over the gap -> (read here: prediction from the past) -> cell -> (read here)
 
-`models.zoo` names the choices. Training, prediction and streaming all run `Model.forward`: a stream
+`models.zoo` has the choices. Training, prediction and streaming all run `Model.forward`: a stream
 is the same call with one row and the `RecurrentState` of the rows before.
 """
 
@@ -35,14 +35,14 @@ from offbeat.parts.decay import ExponentialDecay, InputDecay, TrainableDecay
 
 @dataclass(frozen=True, eq=False)
 class Output(Prediction):
-    """A prediction, and the states it was read from.
+    """A prediction, and the states it was decoded from.
 
     Attributes:
         mean: (batch, rows, channels) scaled units; the value expected at each row.
         scale: (batch, rows, channels) of heads that have one; else None.
-        before: (batch, rows, state_size) state on arrival at each row.
+        before: (batch, rows, state_size) state before the observation of each row.
         after: (batch, rows, state_size) state after each row.
-        past: what the rows that follow need; None from `run`.
+        past: recurrent state for later rows; None from `run`.
     """
 
     before: Tensor | None = None
@@ -54,12 +54,12 @@ class Model(BaseModel):
     """A recurrent model of unevenly sampled motion, composed of parts.
 
     Args:
-        config: every field set; `zoo.make_model` fills in what a user leaves open.
-        data: what it is made for.
+        config: with every field set; `zoo.make_model` fills in the others.
+        data: properties of the data that it is made for.
         seed: of the initial weights.
 
     Raises:
-        InputError: a field of the config is open, or parts do not fit together.
+        InputError: a field of the config is None, or parts are incompatible.
     """
 
     def __init__(self, config: ModelConfig, data: DataInfo, *, seed: int = 0) -> None:
@@ -122,7 +122,7 @@ class Model(BaseModel):
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the weights."""
+        """Dtype of the weights."""
         return self.cell.bias.dtype
 
     @property
@@ -131,7 +131,7 @@ class Model(BaseModel):
         return bool(self.config.self_feeding)
 
     def threads(self) -> AbstractContextManager[None]:
-        """A context in which the threads go to what does the work of training this model."""
+        """A context manager that assigns the threads for training this model."""
         return choose(self.spec, self.dtype, self.device).backend.training()
 
     @property
@@ -142,23 +142,23 @@ class Model(BaseModel):
     def empty_state(
         self, batch: int, *, generator: torch.Generator | None = None
     ) -> RecurrentState:
-        """Nothing seen yet, for so many trajectories.
+        """The recurrent state before the first row.
 
         Args:
             batch: number of trajectories.
-            generator: generator of the generator of self-feeding; by default one seeded with 0.
+            generator: generator of self-feeding; by default one seeded with 0.
         """
         if generator is None and self.config.self_feeding:
             generator = torch.Generator().manual_seed(0)
         return RecurrentState.empty(self.first_state(batch), self.mean, generator=generator)
 
     def backend(self) -> tuple[str, str]:
-        """The variant of the scan's backend that runs this model here, and why."""
+        """The variant of the scan's backend that runs this model, and the reason."""
         choice = choose(self.spec, self.dtype, self.device)
         return choice.variant, choice.reason
 
     def first_state(self, batch: int) -> Tensor:
-        """(batch, state_size) before anything is observed.
+        """(batch, state_size) before the first observation.
 
         Args:
             batch: number of trajectories.
@@ -175,12 +175,12 @@ class Model(BaseModel):
         past: RecurrentState | None = None,
         generator: torch.Generator | None = None,
     ) -> Output:
-        """Predicts every row of a batch from what was observed before it.
+        """Predicts every row of a batch from earlier observations.
 
         Args:
             batch: scaled; rows to come, in order.
-            past: what was seen before; by default nothing.
-            generator: of self-feeding; used where `past` is not given.
+            past: state after the earlier rows; by default there are none.
+            generator: of self-feeding; used if `past` is None.
 
         Raises:
             InputError: the batch has other channels than the model.
@@ -209,13 +209,13 @@ class Model(BaseModel):
         generator: torch.Generator | None = None,
         seen: int = 0,
     ) -> Output:
-        """Predicts rows whose step inputs are given: all of `forward` that has parameters.
+        """Predicts rows from their step inputs: the part of `forward` with parameters.
 
         Args:
             prepared: from `step_inputs`, or some trajectories of `prepare`.
-            state: (batch, state_size) before them; by default as nothing has been seen.
+            state: (batch, state_size) before them; by default the first state.
             generator: of self-feeding.
-            seen: number of rows before them.
+            seen: number of earlier rows.
         """
         if state is None:
             state = self.first_state(len(prepared))
@@ -229,7 +229,7 @@ class Model(BaseModel):
             read = shifted.view_as(after)
         found = self.head.decode(read)
         if self.acts:
-            # An action is chosen at its row, so it is read after what was observed there.
+            # An action is chosen at its row, so it is decoded after the observation there.
             then = self.head.decode(after)
             acts = torch.tensor([role == ACTION for role in self.roles], device=after.device)
             scale = found.scale
@@ -243,7 +243,7 @@ class Model(BaseModel):
         return self.head.loss(prediction, target, mask)
 
     def scan_parts(self) -> ScanParts:
-        """All that is trained within the scan."""
+        """The trained parts of the scan."""
         return ScanParts(
             cell=self.cell,
             decay=self.decay.weights() if self.decay is not None else None,
@@ -259,10 +259,10 @@ class Model(BaseModel):
 
         Args:
             batch: scaled; rows to come, in order.
-            past: what was seen before; by default nothing.
+            past: state after the earlier rows; by default there are none.
 
         Returns:
-            The inputs, and the past after the last row but for its state.
+            The inputs, and the past after the last row without its state.
 
         Raises:
             InputError: the batch has other channels than the model.
@@ -298,7 +298,7 @@ class Model(BaseModel):
             values=values,
             mask=mask.to(dtype),
             time_input=self._time_input(at_rows),
-            # A single row is no padding, and a stream of them is a simpler graph.
+            # A single row has no padding, and gives a simpler graph.
             length=batch.valid.sum(dim=1) if batch.rows > 1 else None,
         )
         delta = (at_rows.delta / unit).to(dtype) if spec.decay or spec.input_decay else None
@@ -353,9 +353,9 @@ def _spec(
     driven = hidden + (channels if config.anchored else 0)
     decay_rows = config.decay_rows or "continuous"
     if decay_rows == "every_row" and not isinstance(decay, TrainableDecay):
-        decay_rows = "continuous"  # of elapsed time the two are the same
+        decay_rows = "continuous"  # for elapsed time both are the same
     kind = config.vector_field or "none"
-    tableau(config.solver or "euler")  # an unknown one is refused here
+    tableau(config.solver or "euler")  # raises an error for an unknown one
     units = tuple(config.field_units or ()) if kind == "mlp" else ()
     return ScanSpec(
         channels=channels,
@@ -387,7 +387,7 @@ def _spec(
 def _fed(
     generator: torch.Generator | None, seen: int, rows: int, fraction: float
 ) -> tuple[bool, ...]:
-    """Rows that are fed the decoded state; drawn row by row, as a stream draws; never row 0."""
+    """Draws the rows that are fed the decoded state, row by row as in a stream; never row 0."""
     if generator is None:
         raise InputError("self-feeding draws random numbers: give a generator (empty_state)")
     drawn = torch.rand(rows, generator=generator).tolist()  # the same draws as one by one
@@ -410,7 +410,7 @@ def _check(config: ModelConfig) -> None:
     ]
     if open_fields:
         raise InputError(
-            f"model options left open: {', '.join(open_fields)}; offbeat.make_model fills them in"
+            f"model options not set: {', '.join(open_fields)}; offbeat.make_model fills them in"
         )
     if config.cell == "none" and config.vector_field == "none":
         raise InputError("a model needs a cell or a vector field; got neither")
@@ -418,8 +418,8 @@ def _check(config: ModelConfig) -> None:
         raise InputError("anchored, input_decay and self_feeding need a cell")
     if config.decay_rows == "observed_rows" and config.readout == "target":
         raise InputError(
-            "decay_rows='observed_rows' with readout='target' would tell a prediction whether its "
-            "own row is observed; use readout='last_row', or another decay_rows"
+            "decay_rows='observed_rows' with readout='target' would make a prediction depend on "
+            "whether its own row is observed; use readout='last_row', or another decay_rows"
         )
     if config.self_feeding and config.head != "point":
         raise InputError(f"self_feeding needs the head 'point', got {config.head!r}")

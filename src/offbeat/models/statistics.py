@@ -1,4 +1,4 @@
-"""What a model must know of its training data, measured once and saved with it."""
+"""Statistics of the training data, saved with the model."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Statistics:
 
     Attributes:
         mean: per channel, over observed values: the empirical mean of equation 27.
-        std: per channel, over observed values; 1 where a channel never moves.
+        std: per channel, over observed values; 1 for a constant channel.
         median_gap: s, between consecutive rows.
-        longest_elapsed: s, longest time from a row back to the last observed row.
+        longest_elapsed: s, longest time since the last observed row.
         longest_delta: s, longest time since observation of any channel (equation 25).
         rows: of the longest training trajectory; 0 in checkpoints of 0.1.
     """
@@ -49,7 +49,7 @@ class Statistics:
         if (count == 0).any():
             raise InputError(
                 f"channel {int((count == 0).long().argmax())} is never observed in the training "
-                "part; leave it out, nothing can be learned about it"
+                "part; leave it out"
             )
         values = batch.values.double()
         mean = torch.where(mask, values, 0.0).sum(dim=(0, 1)) / count
@@ -59,7 +59,7 @@ class Statistics:
         gaps = (batch.times[:, 1:] - batch.times[:, :-1])[batch.valid[:, 1:]]
         if not len(gaps):
             raise InputError(
-                "every training trajectory has a single row; a model of motion needs at least one "
+                "every training trajectory has a single row; a model needs at least one "
                 "trajectory of two rows"
             )
         longest = [_longest(batch, mask.any(dim=2, keepdim=True)), _longest(batch, mask)]
@@ -73,7 +73,7 @@ class Statistics:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form; floats survive to the last bit."""
+        """JSON-like form; floats are exact."""
         return asdict(self)
 
     @classmethod
@@ -86,7 +86,7 @@ class Statistics:
 
 
 def _longest(batch: Batch, mask: torch.Tensor) -> float:
-    """Longest time from a valid row back to the last observation before it; 0 if there is none."""
+    """Longest time from a valid row back to the previous observation; 0 if there is none."""
     index = last_index(mask)
     times = batch.times[..., None].expand(index.shape)
     since = times - times.gather(1, index.clamp_min(0))

@@ -1,6 +1,6 @@
-"""The zoo: each model of the field as a choice of parts and a training recipe.
+"""The zoo: models as choices of parts with training recipes.
 
-Table 2.1 of the thesis, as code. Models of one's own are registered beside it.
+These are the models of table 2.1 of the thesis. `register_model` adds others.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ ZOO: dict[str, dict[str, Any]] = {
         "typical_gap": 0.3,
     },
 }
-"""What each model changes of the common choice."""
+"""Options of each model that differ from the common choice."""
 
 THESIS_MODELS = ("gru", "gru_d", "ode_rnn", "ode_gru_d")
 """The four models that the thesis compares."""
@@ -105,7 +105,7 @@ class ModelEntry:
     Attributes:
         options: fields of `ModelConfig` that differ from the common choice.
         recipe: fields of `TrainConfig` that the model is trained with by default.
-        factory: of a model of one's own: (data, **options) to a module; None for a composed one.
+        factory: of a registered module: (data, **options) to a module; None for a composed model.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -126,14 +126,14 @@ MODELS: Registry[ModelEntry] = Registry("model", group="offbeat.models", adopt=_
 """Models by the name that `make_model` takes."""
 
 for _name, _options in ZOO.items():
-    # An anchored state holds the prediction itself, so one bad step is seen by all that follow:
+    # An anchored state is the prediction itself, so a bad step affects all later ones:
     # it needs Adam, cosine decay and clipped gradients.
     _recipe = _ANCHORED_RECIPE if _options.get("anchored") else _THESIS_RECIPE
     MODELS.register(_name, ModelEntry(_options, _recipe))
 
 
 def list_models() -> tuple[str, ...]:
-    """Names of all models that `make_model` makes, those of other packages included."""
+    """Names of all models that `make_model` supports, including those of other packages."""
     return tuple(MODELS)
 
 
@@ -144,11 +144,11 @@ def register_model(
     recipe: Mapping[str, Any] | None = None,
     replace: bool = False,
 ) -> None:
-    """Adds a model that `make_model`, `fit`, `evaluate` and the command line know by name.
+    """Registers a model for `make_model`, `fit`, `evaluate` and the command line.
 
     Args:
         name: of the model.
-        model: a class or function that is called with a `DataInfo` and keyword options and gives a
+        model: a class or function that takes a `DataInfo` and keyword options and returns a
             `torch.nn.Module` whose `forward(batch)` returns a `Prediction` of every row from what
             was observed before it; or a choice of parts, as fields of `ModelConfig`.
         recipe: fields of `TrainConfig` to train it with; by default Adam at 0.001 for a module,
@@ -176,7 +176,7 @@ def register_model(
 
 
 def resolve(config: ModelConfig) -> ModelConfig:
-    """Fills what a config leaves open with the choice of its zoo entry.
+    """Replaces None in a config by the choice of its zoo entry.
 
     Raises:
         InputError: the zoo has no such entry.
@@ -191,11 +191,11 @@ def resolve(config: ModelConfig) -> ModelConfig:
 
 
 def thesis_config(name: str, **options: Any) -> ModelConfig:
-    """A model of the thesis under the thesis' protocol, oddities included.
+    """The configuration of a model in the thesis' protocol.
 
-    Predictions are read from the last row, the state moves from the first row on, gamma_h compounds
+    Predictions are decoded from the last row, the clock starts at the first row, gamma_h compounds
     at every row of the grid, a plain GRU is given the gap since the row before, and self-feeding,
-    where it is on, leaves h undecayed at masked rows.
+    where it is on, does not decay h at masked rows.
 
     Args:
         name: `gru`, `gru_d`, `ode_rnn` or `ode_gru_d`.
@@ -214,7 +214,7 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
 
 
 def train_config(name: str, **options: Any) -> TrainConfig:
-    """The recipe of a model: how it is trained by default, every field set.
+    """The training recipe of a model, with every field set.
 
     Args:
         name: of the model.
@@ -229,12 +229,12 @@ def train_config(name: str, **options: Any) -> TrainConfig:
 
 
 def recipe_of(name: str, config: TrainConfig | None = None, *, validated: bool) -> Recipe:
-    """How a model is trained: what is asked for, and the model's own recipe beside it.
+    """The training configuration of a model, completed by its recipe.
 
     Args:
-        name: of the model; one that is not registered gets the recipe of a module of one's own.
-        config: what is asked for; None leaves everything to the recipe.
-        validated: whether there is a validation set; the best weights on it are kept then.
+        name: of the model; an unknown one gets the default recipe of registered modules.
+        config: given options; None for the recipe.
+        validated: whether there is a validation set; then the best weights on it are kept.
     """
     own = MODELS[name].recipe if name in MODELS else _FOREIGN_RECIPE
     asked = {} if config is None else {k: v for k, v in asdict(config).items() if v is not None}
@@ -258,11 +258,11 @@ def make_model(
         train: the training set; means, scales and gaps are measured on its observed values.
         scaler: a kind, fitted on `train`, or a scaler fitted elsewhere.
         seed: of the initial weights.
-        **options: fields of `ModelConfig` that replace the entry's own; for a model of one's own,
+        **options: fields of `ModelConfig` that replace the entry's; for a registered module,
             the arguments of its factory.
 
     Returns:
-        A `Model`, or a `ForeignModel` for a model of one's own.
+        A `Model`, or a `ForeignModel` for a registered module.
 
     Raises:
         InputError: unknown model or option, or a channel that is never observed.
@@ -300,12 +300,12 @@ def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
 
 
 def build(name: str, config: Mapping[str, Any], data: DataInfo, *, seed: int = 0) -> BaseModel:
-    """Makes a model from what a checkpoint says.
+    """Makes a model from the record of a checkpoint.
 
     Args:
         name: of the model.
-        config: fields of `ModelConfig`, or the options of a model of one's own.
-        data: what it was made for.
+        config: fields of `ModelConfig`, or the options of a registered module.
+        data: properties of the data that it is made for.
         seed: of the initial weights.
 
     Raises:

@@ -39,12 +39,12 @@ def solve(
     Args:
         field: `field(s, y)` is dy/dt per unit of model time, (batch, size), where `s` (batch, 1) is
             the fraction of the gap that has passed and `y` (batch, size) the state. It is always
-            called with the whole batch, and must keep its rows apart.
+            called with the whole batch, and must not mix its rows.
         y: (batch, size) states at the start of the gaps.
         duration: (batch, 1) gap of each row in model time; a row of duration 0 keeps its state.
         tableau: the method; an adaptive one steps within the tolerance, any other in equal steps.
         steps: equal steps of every row, or (batch, 1) integers; unused by adaptive methods.
-        most_steps: a bound on `steps` that is known without looking at it, as tracing needs.
+        most_steps: a constant bound on `steps`, for tracing.
         rtol: tolerance relative to the state; used by adaptive methods only.
         atol: tolerance in the units of the state; used by adaptive methods only.
         adjoint_parameters: if given, gradients come from the adjoint method (`solve_adjoint`), and

@@ -1,4 +1,4 @@
-"""Adaptive Runge-Kutta solvers with a step size of each row's own."""
+"""Adaptive Runge-Kutta solvers with a step size per row."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from offbeat.ode.fixed import Field, Steps, check_problem, runge_kutta_step, wei
 from offbeat.ode.tableau import TABLEAUS, Tableau
 
 MAX_STEPS = 10_000
-"""Steps that are tried for a gap, refused ones included, before a solver gives up."""
+"""Maximum number of steps per gap, including rejected ones."""
 
 _SAFETY = 0.9
 _SHRINK, _GROW = 0.2, 10.0
 _LEAST_ERROR = 1e-10
 _LEAST_PREVIOUS = 1e-4
-"""Errors below these count as these, so that one lucky step doesn't upset the controller."""
+"""Lower bounds of errors, so that a single very small error does not affect the controller."""
 _SNAP = 1e-2
-"""A step that would leave less than this fraction of itself takes the rest of the gap along."""
+"""A step is extended to the end of the gap if less than this fraction of it would remain."""
 
 
 def solve_adaptive(
@@ -35,12 +35,12 @@ def solve_adaptive(
 ) -> Tensor:
     """Integrates dy/ds = duration * field(s, y) from s = 0 to 1 within a tolerance.
 
-    Each row chooses its own steps, from the error of that row alone: the root mean square over its
+    Each row has its own steps, controlled by the error of that row: the root mean square over its
     states of error / (atol + rtol * |state|) stays below 1 in every step. The field is always
-    evaluated on the whole batch, since it may hold tensors with a row per row of the batch.
+    evaluated on the whole batch, because it may use tensors with one row per row of the batch.
 
-    The first step tried is the whole gap: most gaps are short, and one step of `tableau.stages`
-    evaluations is then all there is. A row whose gap is 0 keeps its state exactly; where all gaps
+    The first step tried is the whole gap: most gaps are short, and need only one step of
+    `tableau.stages` evaluations. A row whose gap is 0 keeps its state exactly; if all gaps
     are 0 the field isn't evaluated, unless the gaps themselves require gradients. Gradients flow
     through the accepted steps; the step sizes are constants.
 
@@ -51,7 +51,7 @@ def solve_adaptive(
         tableau: a method with an embedded error estimate.
         rtol: tolerance relative to the state.
         atol: tolerance in the units of the state.
-        max_steps: most steps to try, refused ones included.
+        max_steps: maximum number of steps, including rejected ones.
 
     Returns:
         (batch, size) states at the end of the gaps.
@@ -59,7 +59,7 @@ def solve_adaptive(
     Raises:
         InputError: shapes or types disagree, tolerances are not positive, or the method has no
             error estimate.
-        DivergenceError: a row ran out of steps, or its step size became too small to move on.
+        DivergenceError: a row ran out of steps, or its step size became too small.
 
     References:
         Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, 1993, II.4;
@@ -84,7 +84,7 @@ def adaptive_steps(
     max_steps: int = MAX_STEPS,
     reuse: bool = True,
 ) -> Steps:
-    """Yields the steps of `solve_adaptive`; rows that were refused one cover 0 of their gap.
+    """Yields the steps of `solve_adaptive`; rows with a rejected step cover 0 of their gap.
 
     Args:
         field: see `Field`.
@@ -93,12 +93,12 @@ def adaptive_steps(
         tableau: a method with an embedded error estimate.
         rtol: relative tolerance.
         atol: absolute tolerance.
-        max_steps: most steps to try.
-        reuse: start a step from the last slope of the step before, if the method allows it.
+        max_steps: maximum number of steps.
+        reuse: start a step with the last slope of the previous step, if the method allows it.
     """
     _check(tableau, rtol, atol)
     reuse = reuse and tableau.first_same_as_last
-    # The gradient of a gap of 0 is the slope there, which takes a step to find.
+    # The gradient of a gap of 0 is the slope there, which needs a step.
     active = torch.full_like(duration, duration.requires_grad, dtype=torch.bool) | (duration != 0)
     if not bool(active.any()):
         return
@@ -117,7 +117,7 @@ def adaptive_steps(
             y, first = stepped, slopes[-1]
         elif bool(accepted.any()):
             if not bool(error.isfinite().all()):
-                # Infinite slopes of a refused row would turn its zero gradient into NaN.
+                # Infinite slopes of a rejected row would make its zero gradient NaN.
                 stepped, slopes = runge_kutta_step(field, s, taken, y, duration, tableau, first)
             y = torch.where(accepted, stepped, y)
             first = torch.where(accepted, slopes[-1], slopes[0])
@@ -133,22 +133,22 @@ def adaptive_steps(
         size = controller.next_size(h, error, accepted)
         end = s + size
         end = torch.where(end + _SNAP * size >= 1, 1.0, end)
-        # The difference is exact, so that the steps of a row sum to its gap to the last bit.
+        # The difference is exact, so that the steps of a row sum exactly to its gap.
         h = torch.where(active, end - s, 0.0)
-        # A slope that is not finite where the row stands stays so however small the step.
+        # A slope that is not finite at the current state remains so for any step size.
         finite = (slopes[0] * gap).isfinite().all(dim=1, keepdim=True)
         stuck = active & ~(finite & (h > least))
         if bool(stuck.any()):
             why = "even the smallest step misses the tolerance: the vector field jumps or overflows"
             raise _divergence(field, y, gap, s, stuck, tried, tableau, why)
-    raise _divergence(field, y, gap, s, active, max_steps, tableau, "the tolerance asks for more")
+    raise _divergence(field, y, gap, s, active, max_steps, tableau, "the tolerance needs more")
 
 
 class _Controller:
     """Chooses the next step of every row by the PI controller of Gustafsson.
 
     Args:
-        gap: (batch, 1) gives the shape and type of what is kept.
+        gap: (batch, 1) for the shape and type of the state.
         order: order of the method; the estimated error of a step of size h is of order h^order.
     """
 
@@ -158,7 +158,7 @@ class _Controller:
         self._order = order
 
     def next_size(self, h: Tensor, error: Tensor, accepted: Tensor) -> Tensor:
-        """Returns (batch, 1) sizes to try after steps of size `h` that made these errors."""
+        """Returns (batch, 1) sizes of the next steps after steps of size `h` with these errors."""
         error = error.nan_to_num(nan=torch.inf, posinf=torch.inf).clamp(min=_LEAST_ERROR)
         beta = 0.2 / self._order
         onward = error ** (0.75 * beta - 1 / self._order) * self._previous**beta
@@ -166,7 +166,7 @@ class _Controller:
         factor = _SAFETY * torch.where(accepted, onward, again)
         factor = factor.clamp(min=_SHRINK).minimum(self._grow)
         self._previous = torch.where(accepted, error, self._previous).clamp(min=_LEAST_PREVIOUS)
-        self._grow = torch.where(accepted, _GROW, 1.0)  # no growth right after a refusal
+        self._grow = torch.where(accepted, _GROW, 1.0)  # no growth directly after a rejection
         return h * factor
 
 

@@ -1,4 +1,4 @@
-"""Gradients of an ODE solution by the adjoint method, in memory that doesn't grow with steps."""
+"""Gradients of an ODE solution by the adjoint method, with memory independent of the steps."""
 
 from __future__ import annotations
 
@@ -32,39 +32,40 @@ def solve_adjoint(
 ) -> Tensor:
     """Integrates dy/ds = duration * field(s, y), with gradients by the adjoint method.
 
-    The way there is not recorded. The way back integrates, from s = 1 to 0 with the same solver
-    and tolerance, the state y, the adjoint a = dL/dy, and the gradients
+    The forward pass is not recorded. The backward pass integrates, from s = 1 to 0 with the same
+    solver and tolerance, the state y, the adjoint a = dL/dy, and the gradients
 
         dy/ds = duration * f,    da/ds = -duration * a^T df/dy,
         dL/dtheta = sum over rows of the integral of duration * a^T df/dtheta over s,
         dL/dduration = the integral of a^T f over s.
 
-    That is algorithm 1, equations (36) to (40), of the thesis. Two things are done better. The two
-    integrals do not steer the step size, since nothing feeds back from them. And a, in which the
+    This is algorithm 1, equations (36) to (40), of the thesis, with two improvements. The two
+    integrals do not affect the step size, because nothing depends on them. And a, in which the
     problem is linear, is integrated as a multiple of its size at the end of the gap, so that the
-    absolute tolerance means the same whatever the scale of the loss.
+    absolute tolerance does not depend on the scale of the loss.
 
     With a solver of fixed steps the gradient is that of the ODE, not of the steps: the two differ
-    by as much as the solver errs.
+    by the error of the solver.
 
     Args:
-        field: see `Field`; it is evaluated again on the way back, so it must not change.
+        field: see `Field`; it is evaluated again in the backward pass, so it must not change.
         y: (batch, size) states at the start of the gaps.
         duration: (batch, 1) gap of each row.
         take_steps: takes the steps.
         weights: of the stages of a step, as in `Tableau.b`.
-        parameters: the tensors that the field closes over, leaves or not, shared by the rows or
-            with a row per row. These, `y` and `duration` get gradients, and nothing else does.
+        parameters: tensors that the field closes over, leaves or not, common to all rows or
+            with one row per row. Only these, `y` and `duration` get gradients.
 
     Returns:
         (batch, size) states at the end of the gaps.
 
     Raises:
-        DivergenceError: an adaptive solver could not keep the tolerance, on the way there or back.
+        DivergenceError: an adaptive solver could not keep the tolerance, in the forward or backward
+            pass.
 
     References:
         Chen et al., Neural Ordinary Differential Equations, NeurIPS 2018;
-        Kidger et al., "Hey, that's not an ODE", ICML 2021 (what steers the step size).
+        Kidger et al., "Hey, that's not an ODE", ICML 2021 (control of the step size).
     """
     result: Tensor = _Adjoint.apply(  # type: ignore[no-untyped-call]
         field, take_steps, weights, y, duration, *parameters
@@ -85,8 +86,8 @@ class _Adjoint(torch.autograd.Function):
         duration: Tensor,
         *parameters: Tensor,
     ) -> Tensor:
-        end = y.clone()  # a node can't return its own input, which a gap of 0 is left with
-        for state, _ in take_steps(field, end, duration):
+        end = y.clone()  # a node can't return its own input, which is the result for a gap of 0
+        for state, _ in walk(field, end, duration):
             end = state
         ctx.field, ctx.take_steps, ctx.weights = field, take_steps, weights
         ctx.save_for_backward(end, duration, *parameters)
@@ -113,7 +114,7 @@ class _Adjoint(torch.autograd.Function):
                 augmented.integrate(taken)
                 state = after
         except DivergenceError as error:
-            raise DivergenceError(f"on the way back through the adjoint, {error}") from error
+            raise DivergenceError(f"in the backward pass of the adjoint, {error}") from error
         found = iter(augmented.gradients)
         return (
             None,
@@ -126,15 +127,15 @@ class _Adjoint(torch.autograd.Function):
 
 
 class _Augmented:
-    """The field of (y, a) over r = 1 - s, which keeps the graphs of a step for its integrals.
+    """The field of (y, a) over r = 1 - s; keeps the graphs of a step for its integrals.
 
     Args:
         field: the field of y.
         weights: of the stages of a step.
         duration: (batch, 1) gap of each row.
-        scale: (batch, 1) what the adjoint was divided by.
-        parameters: what to take gradients for.
-        needs_duration: whether to take that of the gap.
+        scale: (batch, 1) divisor of the adjoint.
+        parameters: tensors to compute gradients for.
+        needs_duration: whether to compute the gradient of the gap.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class _Augmented:
         self._duration = duration
         self._scale = scale
         self._parameters = parameters
-        # A step that was refused, or taken again, leaves its stages behind; only the last count.
+        # A rejected or repeated step leaves its stages; only the last ones count.
         self._stages: deque[tuple[Tensor, Tensor]] = deque(maxlen=len(weights))
 
     def __call__(self, r: Tensor, state: Tensor) -> Tensor:
@@ -175,7 +176,7 @@ class _Augmented:
         """Adds to both integrals the step that covered `taken` (batch, 1) of each gap.
 
         The weight of a row scales its cotangent, so that one product with the Jacobian serves
-        parameters that the rows share and parameters with a row per row.
+        parameters common to all rows and parameters with one row per row.
         """
         if not bool(taken.any()):
             return

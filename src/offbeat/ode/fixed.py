@@ -1,4 +1,4 @@
-"""Runge-Kutta steps, and solvers that take a known number of them over each row's own gap."""
+"""Runge-Kutta steps, and solvers with a known number of steps over the gap of each row."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from offbeat.ode.tableau import Tableau
 Field = Callable[[Tensor, Tensor], Tensor]
 """A vector field: `field(s, y)` is dy/dt per unit of model time, (batch, size).
 
-`s` (batch, 1) is the fraction of each row's gap that lies behind it, from 0 to 1, and `y`
-(batch, size) the state. Row b of the result may depend on row b of the arguments alone.
+`s` (batch, 1) is the fraction of each row's gap that has passed, from 0 to 1, and `y`
+(batch, size) the state. Row b of the result may depend only on row b of the arguments.
 """
 
 Steps = Iterator[tuple[Tensor, Tensor]]
@@ -37,20 +37,20 @@ def solve_fixed(
         field: see `Field`.
         y: (batch, size) states at the start of the gaps.
         duration: (batch, 1) gap of each row in model time; a row of duration 0 keeps its state.
-        tableau: the method; of an adaptive one the embedded result is left unused.
+        tableau: the method; the embedded result of an adaptive one is not used.
         steps: number of steps of every row, or (batch, 1) integers, one for each row.
-        most_steps: a bound on `steps` that is known without looking at it, as tracing needs.
+        most_steps: a constant bound on `steps`, for tracing.
 
     Returns:
         (batch, size) states at the end of the gaps.
 
     Raises:
-        InputError: shapes or types disagree, or there are fewer steps than one.
+        InputError: shapes or types disagree, or there is less than one step.
     """
     check_problem(y, duration)
     steps = steps if most_steps else _shared(steps, duration)
     if tableau.stages == 1 and isinstance(steps, int) and steps == 1:
-        # Nearly every step of training is this one, so it must cost no more than the field.
+        # The common case in training, which must cost no more than the field.
         return torch.addcmul(y, duration, field(torch.zeros_like(duration), y))
     for state, _ in fixed_steps(field, y, duration, tableau, steps, most_steps):
         y = state
@@ -76,7 +76,7 @@ def fixed_steps(
         tableau: the method.
         steps: number of steps, or (batch, 1) of them.
         most_steps: see `solve_fixed`.
-        reuse: start a step from the last slope of the step before, if the method allows it.
+        reuse: start a step with the last slope of the previous step, if the method allows it.
     """
     slopes: list[Tensor] = []
     for s, h, moving in _grid(duration, steps, most_steps):
@@ -95,16 +95,16 @@ def runge_kutta_step(
     tableau: Tableau,
     first: Tensor | None = None,
 ) -> tuple[Tensor, list[Tensor]]:
-    """Takes one step of each row's own size.
+    """Takes one step with a size per row.
 
     Args:
         field: see `Field`.
-        s: (batch, 1) where the rows stand, as fractions of their gaps.
-        h: (batch, 1) how far they go; a row with 0 stays where it is.
+        s: (batch, 1) positions of the rows, as fractions of their gaps.
+        h: (batch, 1) step sizes; a row with 0 keeps its state.
         y: (batch, size) states at `s`.
         duration: (batch, 1) gap of each row.
         tableau: the method.
-        first: (batch, size) the slope at (s, y), where it is already known.
+        first: (batch, size) the slope at (s, y), if known.
 
     Returns:
         (batch, size) states at `s + h`, and the slopes of all stages.
@@ -123,7 +123,7 @@ def runge_kutta_step(
 def weighted_sum(slopes: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
     """Returns the sum of `weights[i] * slopes[i]`.
 
-    Elementwise and in a fixed order: a matrix product would round a row as its batch mates have it.
+    Elementwise and in a fixed order: the rounding of a matrix product depends on other rows.
     """
     terms = [(k, w) for k, w in zip(slopes, weights, strict=True) if w != 0]
     if not terms:
@@ -155,7 +155,7 @@ def _grid(
     """Yields (batch, 1) start and length of each step, and which rows move (None: all)."""
     steps = steps if most_steps else _shared(steps, duration)
     s = torch.zeros_like(duration)
-    # Lengths are differences of the ends, so that s + h is the end to the last bit.
+    # Lengths are differences of the ends, so that s + h is exactly the end.
     if isinstance(steps, int):
         for i in range(steps):
             end = torch.full_like(duration, (i + 1) / steps)
@@ -170,7 +170,7 @@ def _grid(
 
 
 def _shared(steps: int | Tensor, duration: Tensor) -> int | Tensor:
-    """Returns the number of steps that all rows share, or `steps` as it is, after checking it."""
+    """Checks `steps`; returns one number if it is equal for all rows."""
     if isinstance(steps, int):
         if steps < 1:
             raise InputError(f"steps is {steps}, expected 1 or more")

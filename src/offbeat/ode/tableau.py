@@ -20,12 +20,12 @@ class Tableau:
     `y + h * sum(a[i][j] * k[j] for j < i)`; the step ends at `y + h * sum(b[i] * k[i])`.
 
     Args:
-        name: what configs and messages call it.
+        name: in configs and messages.
         order: the error of one step is of order `order + 1`.
         a: row i holds the i weights of the slopes before stage i; the first row is empty.
         b: one weight per stage, of the result.
         c: one time per stage, as a fraction of the step; the first is 0.
-        reference: where the method was published.
+        reference: publication of the method.
         b_low: weights of the embedded result of order `order - 1`, whose distance from the result
             estimates the error; None for a method of fixed steps.
         first_same_as_last: the last stage is evaluated at the end of the step, so that its slope
@@ -33,7 +33,7 @@ class Tableau:
 
     Raises:
         InputError: lengths disagree, a row of `a` does not sum to its `c`, weights do not sum to
-            one, or the last stage is not where `first_same_as_last` says it is.
+            one, or the last stage contradicts `first_same_as_last`.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Tableau:
                 )
         if self.first_same_as_last and (self.a[-1] != self.b[:-1] or self.b[-1] != 0):
             raise InputError(
-                f"{where} says that its last stage is the first of the next step, but the last row "
+                f"{where} has first_same_as_last, but the last row "
                 f"of a is {self.a[-1]}, expected b without its last weight, {self.b[:-1]}"
             )
 
@@ -81,7 +81,7 @@ class Tableau:
 
     @property
     def adaptive(self) -> bool:
-        """Whether the method estimates its own error, as `solve_adaptive` needs it."""
+        """Whether the method estimates its error, which `solve_adaptive` needs."""
         return self.b_low is not None
 
     @cached_property
