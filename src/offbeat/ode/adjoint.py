@@ -87,7 +87,7 @@ class _Adjoint(torch.autograd.Function):
         *parameters: Tensor,
     ) -> Tensor:
         end = y.clone()  # a node can't return its own input, which is the result for a gap of 0
-        for state, _ in walk(field, end, duration):
+        for state, _ in take_steps(field, end, duration):
             end = state
         ctx.field, ctx.take_steps, ctx.weights = field, take_steps, weights
         ctx.save_for_backward(end, duration, *parameters)
