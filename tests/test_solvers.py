@@ -126,7 +126,7 @@ def test_coefficients_meet_every_order_condition_up_to_the_stated_order_and_no_m
         ({"b_low": (1.0,)}, "b_low has 1 weights"),
         ({"a": ((), (0.25, 0.25))}, r"rows of \[0, 2\] coefficients"),
         ({"order": 0}, "order 0, expected 1 or more"),
-        ({"first_same_as_last": True}, "last stage is the first of the next step"),
+        ({"first_same_as_last": True}, "has first_same_as_last"),
     ],
 )
 def test_a_wrong_tableau_is_refused(change, message):
