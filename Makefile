@@ -12,7 +12,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
 
-# An environment that was half made, was moved, or has lost its interpreter is made anew.
+# An incomplete or moved environment, or one without its interpreter, is created again.
 SOUND := $(shell [ -e .venv/.made ] && [ ! -e .venv/.installing ] \
 	&& [ "$$(cat .venv/.made)" = "$(CURDIR)" ] \
 	&& $(BIN)/python -c 'import pip; $(RECENT)' 2>/dev/null && echo yes)

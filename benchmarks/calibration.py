@@ -54,7 +54,7 @@ def run(
         seed: of windows, masks, split, weights and batches.
         n_trajectories: 10,000 in the protocol.
         threads: of torch.
-        clock: when the state of a thesis model begins to change: `first_row`, as in the thesis, or
+        clock: start of the clock of a thesis model: `first_row`, as in the thesis, or
             `first_observation`, the default of other models.
         out: folder; the run goes to a subfolder of it.
     """

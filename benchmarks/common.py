@@ -1,4 +1,4 @@
-"""What the benchmarks share: data of the protocol's shape, and a description of the machine."""
+"""Helpers of the benchmarks: data of the protocol's shape, and a description of the machine."""
 
 from __future__ import annotations
 

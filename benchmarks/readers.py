@@ -3,7 +3,7 @@
     python benchmarks/readers.py [--rows 1000000] [--channels 30] [--repeats 3] [--out FILE]
 
 The file is written once, with a clock in nanoseconds and one value in twenty missing. The readers
-take turns; wall and CPU seconds, medians and minima. pyarrow alone, which makes columns and no
+alternate; wall and CPU seconds, medians and minima. pyarrow alone, which makes columns and no
 trajectories, is timed for comparison.
 """
 

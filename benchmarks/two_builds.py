@@ -2,7 +2,7 @@
 
     python benchmarks/two_builds.py ../old . --json runs/two_builds.json
 
-Each checkout runs in a process of its own, with its `src` on the path and its compiled module
+Each checkout runs in a separate process, with its `src` on the path and its compiled module
 there. The processes take turns: one trains for some steps while the other waits. The script uses
 only what all versions since 0.1.0 have.
 """

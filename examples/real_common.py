@@ -1,7 +1,7 @@
 """What the three examples on real logs share: a log in, a table, a figure and a JSON file out.
 
-Each example says what its log is made of (`Log`); `run` trains a causal and a backward model on it
-and scores them beside the trivial predictors. Learning rate and epoch are chosen on the validation
+Each example describes its log (`Log`); `run` trains a causal and a backward model on it
+and scores them with the trivial predictors. Learning rate and epoch are chosen on the validation
 part; the test part is looked at once, at the end.
 """
 
@@ -36,7 +36,7 @@ RATES = (0.001, 0.004)
 
 @dataclass(frozen=True)
 class Log:
-    """A log and what is asked of it.
+    """A log and the settings of its evaluation.
 
     Attributes:
         name: of the JSON file and of the figure.
@@ -46,7 +46,7 @@ class Log:
         tests: test parts by name, as logged; the figure shows the first.
         window: rows of a training window.
         windows: windows drawn from each training trajectory.
-        sensors: channels that fall silent together.
+        sensors: channels that drop out together.
         silence_s: how long they do.
         horizons_s: of the extrapolation.
         groups: channels whose errors are one line of the printed tables, by name.
@@ -74,12 +74,12 @@ class Log:
 
 
 def data_folder() -> Path:
-    """Where the logs lie that are no part of this repository: OFFBEAT_DATA, or beside it."""
+    """Folder of logs that are not part of this repository: OFFBEAT_DATA, or next to it."""
     return Path(os.environ.get("OFFBEAT_DATA") or ROOT.parent / "shared" / "data")
 
 
 def silenced(log: Log, dataset: ob.Dataset, *, seed: int = 0) -> ob.Dataset:
-    """Masks 30 % of each sensor, in dropouts of its own, to be imputed."""
+    """Masks 30 % of each sensor in independent dropouts, to be imputed."""
     return ob.mask_out(
         dataset,
         0.7,
@@ -91,10 +91,10 @@ def silenced(log: Log, dataset: ob.Dataset, *, seed: int = 0) -> ob.Dataset:
 
 
 def views(log: Log, dataset: ob.Dataset, seed: int) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset]:
-    """The same windows as logged, with silent sensors, and with outages of all sensors.
+    """The same windows as logged, with dropouts of single sensors, and with outages of all.
 
-    A model is only as good as what it has seen: whole rows teach it the next row, silences to fill
-    from other sensors, outages to go on for as long as a forecast does.
+    A model learns from its data only: complete rows teach it to predict the next row, dropouts to
+    fill from other sensors, outages to forecast for a longer time.
     """
     return (
         dataset,
@@ -253,7 +253,7 @@ def trained(
 
 
 def scores(log: Log, pair: ob.TwoSided, test: ob.Dataset) -> dict[str, Any]:
-    """One step ahead and forecasts on the test part as logged, fills of what is hidden in it."""
+    """One step ahead and forecasts on the test part as logged, fills of its masked values."""
     print(f"\n{len(test)} test trajectories, {sum(t.rows for t in test)} rows")
     one = ob.evaluate(pair.forward, test).in_units()
     show(log, one)
@@ -300,7 +300,7 @@ def show(log: Log, found: ChannelScores, verdict: str | None = None) -> None:
 
 
 def draw(log: Log, pair: ob.TwoSided, path: Path) -> None:
-    """One test trajectory with silent sensors: truth, the model's fills, PCHIP."""
+    """One test trajectory with dropouts: truth, the model's fills, PCHIP."""
     test = silenced(log, next(iter(log.tests.values())), seed=4)
     one = ob.Dataset((test[min(log.draw_from, len(test) - 1)],)).select(pair.forward.names)
     truth = one[0]

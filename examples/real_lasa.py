@@ -1,4 +1,4 @@
-"""LASA handwriting: a pen whose position and velocity sensors fall silent on their own.
+"""LASA handwriting: a pen whose position and velocity sensors drop out independently.
 
     python examples/real_lasa.py --out results/real_logs --figures docs/figures
 

@@ -1,10 +1,10 @@
-"""A PX4 flight log: IMU at 250 Hz and attitude at 83 Hz, each on stamps of its own.
+"""A PX4 flight log: IMU at 250 Hz and attitude at 83 Hz, each with its own stamps.
 
     OFFBEAT_DATA=FOLDER python examples/real_px4.py --out results/real_logs --figures docs/figures
 
 The log is `px4_ulog/sample.ulg` (69 s, one of pyulog's). Its board is moved by hand from 2 s to
 6.2 s and lies still for the rest, where nothing but noise can be tested. So the moving part is
-split in time by itself, and a stretch of the still part is trained on, and tested on its own. The
+split in time by itself, and a part without motion is used for training, and tested separately. The
 actuator outputs are constant in this log and are left out.
 """
 

@@ -7,7 +7,7 @@ It subscribes to `joint_states` and publishes a `JointState` on `predicted_joint
 message: the joints as they will be `horizon_s` after the newest stamp, from all that was received.
 A joint that a message leaves out was not measured; messages of one stamp are one row, so several
 drivers may publish on the topic. Late messages are put where they belong, and stamps that jump
-(a simulation that starts again) begin anew, as `offbeat.StreamOptions` tells. What was counted is
+(a simulation that restarts) reset the stream, see `offbeat.StreamOptions`. The counters are
 logged every ten seconds.
 
 Besides Offbeat it needs a sourced ROS 2 (rclpy, sensor_msgs). The model may be the folder of a run
@@ -36,7 +36,7 @@ class JointChannels:
 
     Args:
         channels: names of the model's channels: `position.JOINT`, `velocity.JOINT`, `effort.JOINT`.
-        prefix: what stands before these in the model, such as the name of a topic.
+        prefix: prefix of these names in the model, such as the name of a topic.
 
     Raises:
         ValueError: no channel is one of a joint.
@@ -105,7 +105,7 @@ def answer(
         joints: of the model.
         message: as received.
         reply: to be published.
-        now: ns, stands for the stamp of a message that has none.
+        now: ns, used as the stamp of a message that has none.
         horizon_s: from the newest stamp to the time predicted at.
 
     Raises:
@@ -162,12 +162,12 @@ def main() -> None:
             self.create_timer(10.0, self.report)
 
         def receive(self, message: Any) -> None:
-            """Answers a message; one that can't be used is logged, and the node goes on."""
+            """Answers a message; an invalid one is logged, and the node continues."""
             reply, now = JointState(), self.get_clock().now().nanoseconds
             try:
                 answer(self.stream, self.joints, message, reply, now=now, horizon_s=self.horizon_s)
             except ArithmeticError as error:  # the state is of no use any more
-                self.get_logger().error(f"{error}; it begins anew")
+                self.get_logger().error(f"{error}; it is reset")
                 self.stream.reset()
             except OffbeatError as error:
                 self.get_logger().warning(str(error), throttle_duration_sec=1.0)

@@ -46,13 +46,13 @@ def dataset(count: int = 4, *, seed: int = 0, **options: Any) -> Dataset:
 
 
 def with_observed(one: Trajectory, observed: Any) -> Trajectory:
-    """The trajectory with another choice of observed cells."""
+    """The trajectory with another mask."""
     mask = np.broadcast_to(np.asarray(observed, dtype=bool), one.values.shape).copy()
     return Trajectory(one.times, one.values, observed=mask, names=one.names, units=one.units)
 
 
 def draw_weights(model: Model, *, seed: int = 1, std: float = 0.4) -> Model:
-    """Draws every parameter, biases too: initial weights are so small that they hide faults."""
+    """Draws every parameter, biases too: small initial weights would hide errors."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in model.parameters():

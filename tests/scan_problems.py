@@ -116,7 +116,7 @@ def problem(
     scale: float = 0.5,
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
-    """A scan with random weights; about half of the cells are observed, some gaps are 0."""
+    """A scan with random weights; about half of the values are observed, some gaps are 0."""
     generator = torch.Generator().manual_seed(seed)
     driven = hidden + (channels if anchored else 0)
     features = {"none": 0, "delta": channels, "elapsed": 1}[decay]

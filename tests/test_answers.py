@@ -81,7 +81,7 @@ def test_interpolation_holds_outside_its_observations():
         assert fill(lonely, method, [0.0])[:, 0].tolist() == [6, 6, 6]
 
 
-def test_pchip_is_scipys_per_channel_on_the_observed_cells():
+def test_pchip_is_scipys_per_channel_on_the_observed_values():
     (one,) = dataset(1, rows=40)
     got = fill(one, "pchip", [0.0] * 3)
     for channel in range(3):
@@ -425,7 +425,7 @@ def test_numbers_of_targets_that_are_none_are_refused(targets):
 # --- scores ---------------------------------------------------------------------------------------
 
 
-def test_imputation_is_scored_by_its_definition_on_the_same_cells_for_all():
+def test_imputation_is_scored_by_its_definition_on_the_same_values_for_all():
     data = dataset(4, rows=20)
     pair = pair_of(data)
     scores = ob.score_imputation(pair, data).scores
@@ -452,7 +452,7 @@ def test_imputation_is_scored_by_its_definition_on_the_same_cells_for_all():
         assert scores.overall[name] == pytest.approx(np.sqrt(np.mean(together**2)), rel=1e-12)
 
 
-def test_groups_of_gaps_share_out_the_cells_between_observations():
+def test_groups_of_gaps_partition_the_values_between_observations():
     data = dataset(4, rows=20)
     result = ob.score_imputation(pair_of(data), data)
     inside = 0

@@ -1,4 +1,4 @@
-"""Baselines: values that can be computed by hand, and what each may look at."""
+"""Baselines: values with closed forms, and the inputs of each baseline."""
 
 from __future__ import annotations
 

@@ -114,7 +114,7 @@ def test_a_batch_holds_each_trajectory_and_pads_its_end() -> None:
         assert (batch.values[i, rest] == 0).all()
 
 
-def test_unknown_cells_become_0_and_are_neither_known_nor_observed() -> None:
+def test_unknown_values_become_0_and_are_neither_known_nor_observed() -> None:
     one = Trajectory([0.0, 1.0], [[NAN, 2.0], [3.0, NAN]])
     batch = Batch.of([one])
     assert batch.values.tolist() == [[[0.0, 2.0], [3.0, 0.0]]]

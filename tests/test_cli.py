@@ -478,7 +478,7 @@ def test_a_channel_that_is_never_observed_is_named(tmp_path, capsys):
 
 
 def test_a_missing_extra_is_named_by_its_extra(tmp_path):
-    """A sitecustomize-like block of `mujoco` stands for a machine without it."""
+    """A sitecustomize-like block of `mujoco` simulates a machine without it."""
     code = (
         "import sys; sys.modules['mujoco'] = None\n"
         "from offbeat.cli.app import main; sys.exit(main(sys.argv[1:]))"

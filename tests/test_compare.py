@@ -1,4 +1,4 @@
-"""Any runs compared: what pairs with what, what is found, and how it is told."""
+"""Any runs compared: pairs of runs, results, and output."""
 
 import csv
 import json
@@ -339,7 +339,7 @@ def test_the_choice_on_the_command_line_is_read():
         parse_only("experiment=2,gru")
 
 
-# --- how it is told -------------------------------------------------------------------------------
+# --- its output -----------------------------------------------------------------------------------
 
 
 def test_the_json_holds_every_number_and_is_strict(record):
@@ -489,7 +489,7 @@ def test_runs_and_tables_of_the_version_before_are_read_under_the_names_of_now(r
     assert run.origin == {"scan_backend": "avx2"}
 
 
-def test_folders_are_paired_by_the_cut_of_the_data_and_sizes_are_told_apart(runs, capsys):
+def test_folders_are_paired_by_the_cut_of_the_data_and_sizes_have_labels(runs, capsys):
     capsys.readouterr()
     found = compare(runs, resamples=200)
     (condition,) = found.conditions

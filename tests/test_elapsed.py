@@ -102,7 +102,7 @@ def by_hand(
 
 
 @given(cases())
-def test_ages_are_those_of_a_plain_loop(case: Case) -> None:
+def test_elapsed_times_are_those_of_a_plain_loop(case: Case) -> None:
     got, _ = measured(case, case.batch)
     for i, one in enumerate(case.trajectories):
         hand = by_hand(one, case.limit, from_first_row=case.from_first_row)
@@ -111,7 +111,7 @@ def test_ages_are_those_of_a_plain_loop(case: Case) -> None:
 
 
 @given(cases(), st.lists(st.integers(1, 8), max_size=4))
-def test_a_carry_over_any_split_of_the_rows_gives_the_same(case: Case, cuts: list[int]) -> None:
+def test_a_state_over_any_split_of_the_rows_gives_the_same(case: Case, cuts: list[int]) -> None:
     batch = case.batch
     whole, end = measured(case, batch)
     edges = sorted({0, batch.rows, *(c for c in cuts if c < batch.rows)})
@@ -164,7 +164,7 @@ def test_padding_is_a_pause_in_which_nothing_elapses(case: Case) -> None:
 
 
 @given(cases(), st.sampled_from([0.0, 1.0, 1_700_000_000.0]))
-def test_ages_do_not_depend_on_where_the_clock_starts(case: Case, shift: float) -> None:
+def test_elapsed_times_do_not_depend_on_where_the_clock_starts(case: Case, shift: float) -> None:
     batch = case.batch
     plain, _ = measured(case, batch)
     moved, _ = measured(case, replace(batch, times=batch.times + shift))
@@ -187,7 +187,7 @@ def test_time_since_the_last_observation_stops_at_its_limit() -> None:
 
 
 @given(cases())
-def test_limited_ages_never_exceed_the_limit_nor_shrink_between_observations(case: Case) -> None:
+def test_limited_times_never_exceed_the_limit_nor_shrink_between_observations(case: Case) -> None:
     batch = case.batch
     limit = 40 * TICK
     got, _ = elapsed_times(batch, empty(batch), elapsed_limit=limit)

@@ -7,7 +7,7 @@ from offbeat.files import atomic_folder, atomic_path, writable, write_json
 
 
 class StopError(Exception):
-    """Stands for anything that ends a writer early."""
+    """Simulates an error that ends a writer early."""
 
 
 def stop_while_writing(path):

@@ -47,8 +47,8 @@ HEAVY = ("torch", "scipy.stats", "matplotlib", "mujoco", "dm_control")
 """Slow to import; `import offbeat` and `offbeat --help` do without them."""
 
 
-def faults(source: Path) -> list[str]:
-    """What in the package at `source` goes against the arrow, a line per fault."""
+def violations(source: Path) -> list[str]:
+    """What in the package at `source` violates the order of imports, a line per violation."""
     found = []
     for path in sorted(source.rglob("*.py")):
         name = path.relative_to(source).with_suffix("").parts[0]
@@ -98,11 +98,11 @@ def stage_of(target: str, source: Path) -> str | None:
 
 
 def test_no_module_imports_from_a_later_stage():
-    assert not faults(SOURCE), "\n" + "\n".join(faults(SOURCE))
+    assert not violations(SOURCE), "\n" + "\n".join(violations(SOURCE))
 
 
 @pytest.mark.parametrize(
-    ("file", "code", "fault"),
+    ("file", "code", "violation"),
     [
         ("errors.py", "from offbeat.files import f", "errors.py:1: errors imports offbeat.files.f"),
         ("data/masking.py", "import offbeat.models.zoo", "data imports offbeat.models.zoo of the"),
@@ -135,13 +135,13 @@ def test_no_module_imports_from_a_later_stage():
         ),
     ],
 )
-def test_the_check_finds_a_fault(tmp_path, file, code, fault):
+def test_the_check_finds_a_violation(tmp_path, file, code, violation):
     path = tmp_path / "offbeat" / file
     path.parent.mkdir(parents=True)
     path.write_text(code, encoding="utf-8")
-    found = faults(tmp_path / "offbeat")
+    found = violations(tmp_path / "offbeat")
     assert len(found) == 1
-    assert fault in found[0]
+    assert violation in found[0]
 
 
 def test_the_check_accepts_imports_along_the_arrow(tmp_path):
@@ -155,7 +155,7 @@ def test_the_check_accepts_imports_along_the_arrow(tmp_path):
         "from .cell import GRUCell\n",
         encoding="utf-8",
     )
-    assert faults(tmp_path / "offbeat") == []
+    assert violations(tmp_path / "offbeat") == []
 
 
 @pytest.mark.parametrize(

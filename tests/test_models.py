@@ -1,4 +1,4 @@
-"""Every model against an answer known from elsewhere: equations by hand, or another library."""
+"""Every model against an answer known from elsewhere: closed equations, or another library."""
 
 from __future__ import annotations
 
@@ -362,7 +362,7 @@ def test_in_gru_d_the_weight_of_gamma_x_is_diagonal_and_that_of_gamma_h_full() -
     assert model.decay.weight.shape == (4, 3)  # type: ignore[union-attr]
 
 
-def test_before_its_first_observation_x_hat_is_the_training_mean_of_observed_cells() -> None:
+def test_before_its_first_observation_x_hat_is_the_training_mean_of_observed_values() -> None:
     train = dataset(6, seed=9)
     model = small_model("gru_d", train)
     cells = np.concatenate([model.scaler.scaled(t.values) for t in train])
@@ -985,9 +985,9 @@ def test_training_data_in_which_a_channel_is_never_observed_is_refused_by_name()
         make_model("gru", Dataset((with_observed(one.slice(0, 1), True),)))
 
 
-def test_a_carry_without_a_generator_cannot_feed_itself() -> None:
+def test_a_state_without_a_generator_cannot_feed_itself() -> None:
     model = small_model("gru", self_feeding=0.5)
     batch = model.batch(sample())
-    carry = replace(model.empty_state(1), generator=None)
+    past = replace(model.empty_state(1), generator=None)
     with pytest.raises(InputError, match="give a generator"):
-        model(batch, past=carry)
+        model(batch, past=past)

@@ -141,7 +141,7 @@ def test_any_runtime_can_run_the_file_from_what_stands_in_it(exported: Any) -> N
 
     path = exported("gru_d")
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    facts = json.loads(session.get_modelmeta().custom_metadata_map["offbeat"])
+    record = json.loads(session.get_modelmeta().custom_metadata_map["offbeat"])
     inputs = {i.name: (i.type, i.shape) for i in session.get_inputs()}
     assert list(inputs) == ["t", "values", *STATE]
     assert inputs["t"] == ("tensor(double)", [1])
@@ -151,8 +151,8 @@ def test_any_runtime_can_run_the_file_from_what_stands_in_it(exported: Any) -> N
     assert outputs == ["prediction", *(f"{name}_next" for name in STATE)]
     inf = np.inf
     state = {
-        "state": np.array(facts["initial"]["state"], dtype=np.float32),
-        "last": np.array(facts["initial"]["last"], dtype=np.float32),
+        "state": np.array(record["initial"]["state"], dtype=np.float32),
+        "last": np.array(record["initial"]["last"], dtype=np.float32),
         "time": np.array([np.nan]),
         "start": np.array([inf]),
         "observed_at": np.array([-inf]),
@@ -166,9 +166,9 @@ def test_any_runtime_can_run_the_file_from_what_stands_in_it(exported: Any) -> N
         assert difference(found[0][0], stream.predict(t)) < 1e-6
         stream.observe(t, values[0])
         state = dict(zip(STATE, found[1:], strict=True))
-    assert facts["names"] == ["channel_0", "channel_1", "channel_2"]
-    assert facts["units"] == ["m"] * 3
-    assert facts["model"] == "gru_d"
+    assert record["names"] == ["channel_0", "channel_1", "channel_2"]
+    assert record["units"] == ["m"] * 3
+    assert record["model"] == "gru_d"
 
 
 def test_what_is_no_number_in_single_precision_was_not_measured(exported: Any) -> None:

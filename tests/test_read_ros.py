@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, beside what `rosbags` makes of them."""
+"""Bags of ROS 1 and ROS 2, compared with `rosbags`."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def test_a_log_of_px4_reads_as_pyulog_reads_it(name):
             assert np.array_equal(values, data[channel].astype(np.float64))
 
 
-def test_the_faults_of_a_real_log_are_what_its_readme_says():
+def test_the_anomalies_of_a_real_log_are_what_its_readme_says():
     recording = one(shared("px4_ulog", "sample.ulg"))
     gyros = next(s for s in recording.signals if s.name == "sensor_combined")
     assert len(gyros.stamps) == 17_070

@@ -16,7 +16,7 @@ ROLES = ("state", "action", "exogenous")
 
 
 def arm(count: int = 12, rows: int = 30, *, roles=ROLES) -> ob.Dataset:
-    """A torque that answers the position just observed, and a wind that nobody predicts."""
+    """A torque that responds to the last observed position, and a wind that is not predicted."""
     made = []
     for i in range(count):
         random = np.random.default_rng(i)

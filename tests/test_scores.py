@@ -1,4 +1,4 @@
-"""Scores: what counts, by hand; and how the three scorings hang together."""
+"""Scores: which values count, and how the three scorings are related."""
 
 import math
 
@@ -25,7 +25,7 @@ def scores_of(batch: Batch, predictions: torch.Tensor, **options: float) -> Scor
     return sums.scores()
 
 
-def test_each_scoring_counts_the_cells_it_names():
+def test_each_scoring_counts_the_values_it_names():
     # Channel 0 is seen from row 1 on, channel 1 from row 2 on; row 3 is hidden.
     values = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]]
     observed = [[False, False], [True, False], [True, True], [False, False]]
@@ -65,7 +65,7 @@ def test_published_is_rows_1_99_plus_the_constant_of_the_hidden_first_rows(seed,
     assert scores.published.mse == pytest.approx(expected, rel=1e-12)
 
 
-def test_cells_that_are_not_known_and_padding_count_nowhere():
+def test_values_that_are_not_known_and_padding_count_nowhere():
     long = trajectory([[1.0, np.nan], [2.0, 5.0], [3.0, 6.0]])
     short = trajectory([[1.0, 1.0], [2.0, 2.0]])
     batch = Batch.of([long, short], dtype=torch.float64)
@@ -95,8 +95,8 @@ def test_parts_add_up_to_the_whole():
     assert split.by_gap[0].score.count == whole.by_gap[0].score.count
 
 
-def test_scores_by_gap_group_by_the_age_of_the_channel():
-    # One channel, seen at row 0 only: ages 0.1 to 0.5 s, groups up to 0.1, 0.2, 0.4, 0.8 s.
+def test_scores_by_gap_group_by_the_time_since_observation():
+    # One channel, observed at row 0 only: 0.1 to 0.5 s since, groups up to 0.1, 0.2, 0.4, 0.8 s.
     observed = np.array([[True]] + [[False]] * 5)
     batch = Batch.of([trajectory(np.zeros((6, 1)), observed)], dtype=torch.float64)
     predictions = torch.arange(6.0, dtype=torch.float64).reshape(1, 6, 1)
@@ -115,7 +115,7 @@ def test_the_last_value_predictor_repeats_what_was_seen_and_starts_from_the_mean
     assert predictions.flatten().tolist() == [9, 9, 2, 2]
 
 
-def test_a_score_without_cells_is_nan_and_null_in_json():
+def test_a_score_without_values_is_nan_and_null_in_json():
     batch = Batch.of([trajectory([[1.0], [2.0]], [[False], [False]])])
     scores = scores_of(batch, torch.zeros(1, 2, 1))
     assert math.isnan(scores.after_first_observation.mse)

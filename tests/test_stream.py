@@ -149,7 +149,7 @@ def test_nanoseconds_since_1970_are_as_good_as_seconds_since_the_start() -> None
         stream.observe(float(t + 10**9), {})
 
 
-def test_a_stream_starts_anew_after_a_reset() -> None:
+def test_a_stream_starts_again_after_a_reset() -> None:
     model, one = build("ode_gru_d-self_feeding", FLOAT32), trajectory(4, 8)
     stream = Stream(model, seed=3)
     first = streamed(stream, one)

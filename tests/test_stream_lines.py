@@ -307,7 +307,7 @@ def test_a_reader_that_goes_away_ends_it_quietly(checkpoint: Path, tmp_path: Pat
         process.stdin.flush()
         assert process.wait(timeout=60) == 0
         assert process.stderr.read() == b""
-    # The row was consumed, although nobody read the answer.
+    # The row was consumed, although the answer was not read.
     assert json.loads(state.read_text())["counters"]["rows"] == 3
 
 

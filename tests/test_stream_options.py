@@ -298,7 +298,7 @@ def test_with_a_limit_a_wrong_stamp_in_the_future_is_pending_and_dropped() -> No
 
 
 def test_a_jump_may_be_replaced_by_the_median_gap() -> None:
-    """For a clock that was corrected while the robot went on; the median gap is 0.1 s."""
+    """For a clock that was corrected while the robot moved; the median gap is 0.1 s."""
     stream = Recorded(jump="continue", confirm=2, jump_ahead_s=60.0)
     said(stream, (100.0, {"a": 1.0}), (100.5, {"a": 2.0}), (0.0, {"a": 3.0}), (0.2, {"a": 4.0}),
          (0.3, {"a": 5.0}), (500.0, {"a": 6.0}), (500.1, {"a": 7.0}))  # fmt: skip
@@ -344,7 +344,7 @@ def test_long_gaps_are_counted_and_may_reset(
     assert stream.counters.resets == (option == "reset")
 
 
-def test_after_a_gap_that_began_anew_older_messages_do_not_come_back() -> None:
+def test_after_a_gap_that_reset_the_state_older_messages_do_not_come_back() -> None:
     stream = Recorded(long_gap="reset", late="reorder", jump="drop")
     said(stream, (0.0, {"a": 1.0}), (5.0, {"a": 2.0}))
     assert said(stream, (-0.5, {"b": 1.0}), (0.0, {"b": 1.0}), (4.5, {"b": 1.0})) == [

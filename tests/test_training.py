@@ -305,13 +305,13 @@ def test_a_folder_that_is_no_checkpoint_or_a_newer_one_is_refused(tmp_path):
         ob.load_model(tmp_path / "nothing")
     folder = tmp_path / "saved"
     ob.save_model(ob.make_model("gru", TRAIN, **SMALL), folder)
-    facts = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**facts, "version": 3}))
+    record = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**record, "version": 3}))
     with pytest.raises(ob.FileFormatError, match="checkpoint version 3"):
         ob.load_model(folder)
 
 
-# --- what must be the same for a run to go on -----------------------------------------------------
+# --- what must be equal to resume a run -----------------------------------------------------------
 
 
 def _bursts(data):
@@ -334,7 +334,7 @@ def _bursts(data):
     ids=["another mask", "bursts", "another order", "another unit"],
 )
 def test_a_run_does_not_go_on_with_other_training_data(changed, message, tmp_path):
-    """In 0.1.0 only counts and sums were compared, so each of these went on in silence."""
+    """In 0.1.0 only counts and sums were compared, so these were resumed silently."""
     whole = swinging(8)
     data = ob.mask_out(whole, 0.5, seed=3)
     config = ob.TrainConfig(epochs=1, batch_size=4)

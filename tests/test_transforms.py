@@ -44,7 +44,7 @@ BOTH = Transforms({"yaw": Angle(TURN, -math.pi)}, (QUATERNION,))
 
 
 def streamed(transforms, given):
-    """What a stream makes of the rows: values and mask for the model, and the state after each."""
+    """Results of a stream for the rows: values and mask for the model, and the state after each."""
     live = LiveTransforms(transforms, given.names)
     state, made = live.start(), []
     for values, mask in zip(given[0].values, given[0].observed, strict=True):

@@ -17,7 +17,7 @@ from thesis.record import SCORINGS
 _TRAJECTORIES, _ROWS, _CHANNELS = 160, 120, 14
 _FRACTION, _EPOCHS = 0.3, 2
 _OLD = re.compile(r"^head\.decoder\.")
-"""Names are hashed as they were when the record was begun: weights of the head as `decoder.*`."""
+"""Names as in 0.1.0, which the record was started with: weights of the head are `decoder.*`."""
 
 
 @cache

@@ -68,7 +68,7 @@ def illustrate(
         progress: show a progress bar of the simulation.
 
     Raises:
-        InputError: an argument is out of bounds, or a model knows other channels.
+        InputError: an argument is out of bounds, or a model has other channels.
         MissingExtraError: mujoco or dm_control is not installed. Without umap-learn there is no
             map, and `missing` says so.
     """
@@ -158,7 +158,7 @@ def hidden_states(
 
     Returns:
         (trajectories, rows, hidden_size) on arrival at each row, and after it. The part of an
-        anchored state that holds the channels is left out.
+        anchored state of the channels is left out.
     """
     generator = torch.Generator().manual_seed(seed) if model.config.self_feeding else None
     with torch.inference_mode():
@@ -188,7 +188,7 @@ def lay_out(states: NDArray[np.float64], *, seed: int = 0) -> NDArray[np.float64
     if len(states) < 20:
         raise InputError(f"a map needs at least 20 states, got {len(states)}; use more rows")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns of its own dependencies when imported
+        warnings.simplefilter("ignore")  # it warns about its dependencies when imported
         umap: Any = require("umap", "umap")
         mapper = umap.UMAP(n_neighbors=15, random_state=seed, n_jobs=1)
         places: NDArray[np.float64] = mapper.fit_transform(states)

@@ -41,7 +41,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class StateMap:
-    """Hidden states of many trajectories, each model's laid out in two dimensions of its own.
+    """Hidden states of many trajectories, in two dimensions per model.
 
     Attributes:
         places: by model, (points, 2) without units.

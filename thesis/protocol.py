@@ -31,7 +31,7 @@ MODELS: dict[str, str] = {
 
 THESIS_ROWS = tuple(MODELS)[:4]
 CONTROLS = ("gru_unfed", "gru_d_unfed")
-"""GRU and GRU-D of the thesis' rows but for self-feeding: they show what it does by itself."""
+"""GRU and GRU-D of the thesis' rows but for self-feeding: they show its effect."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Protocol:
         n_trajectories: simulated (section 3.1).
         recorded_rows: rows per simulated trajectory, one per physics step of 5 ms (section 3.1).
         state_seed: of the initial states: the seed of the public generator of the lost file.
-        window: consecutive rows cut out of each trajectory, the start drawn (section 3.1).
+        window: consecutive rows cut out of each trajectory, with a random start (section 3.1).
         scaler: normalisation `(x - min) / max` over all rows (section 3.1).
         parts: fractions of training, validation and test trajectories (section 3.1).
         observed_fractions: observed fractions of the rows (section 3.1; tables 3.1 to 3.6).

@@ -1,4 +1,4 @@
-"""What of an experiment is worth committing: the record, what made it, and eight small models."""
+"""The parts of an experiment to commit: the record, its provenance, and eight small models."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def publish(
 ) -> None:
     """Copies the record of an experiment, with all that belongs to it, to a folder to commit.
 
-    What stands there is added to, never thrown away: the sessions and models of another machine
+    Existing files are extended, never removed: the sessions and models of another machine
     stay.
 
     Args:
@@ -62,7 +62,7 @@ def _about(
     except (OSError, ValueError):
         before = {}
     lines = [line for name in SESSIONS for line in before.get(name, [])] + read_sessions(out)
-    # Two short ones may begin within one second.
+    # Two short ones may start within one second.
     sessions = {(line["began_at"], line["seconds"]): line for line in lines}
     ordered = [sessions[began] for began in sorted(sessions)]
     typed = [*before.get("commands", []), list(command)]
@@ -90,7 +90,7 @@ def _about(
 
 
 def _without_budget(command: Sequence[str]) -> list[str]:
-    """A command without its time limit, which says when it stopped and not what it made."""
+    """A command without its time limit, which does not affect the results."""
     kept, value = list[str](), False
     for word in command:
         option = word.partition("=")[0] == "--budget_minutes"

@@ -1,4 +1,4 @@
-"""The record of the thesis' runs, under the names of columns that it was begun with."""
+"""The record of the thesis' runs, with its original column names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCORINGS: dict[str, str] = {
     "published": "published",
 }
 """Names of the scorings in the record, each with its name in `offbeat.metrics.SCORINGS`. The record
-was begun under these names; "honest" is the score after the first observation."""
+was started with these names; "honest" is the score after the first observation."""
 
 RUN_COLUMNS: dict[str, type] = {
     "run_id": str,
@@ -71,7 +71,7 @@ LOG_COLUMNS: dict[str, str] = {
 """Columns of the table of curves, each with its name in the `log.csv` of a training."""
 
 GROUP = ("bits", "cpu", "kernel_body", "torch", "data")
-"""Runs that agree in these were made alike; those that do not are never mixed without a mark."""
+"""Runs that agree in these are comparable; others are never mixed without a mark."""
 
 
 class Record(record.Record):

@@ -20,9 +20,9 @@ def report_command(
     summary: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Write the thesis' tables, figures and tests beside those of a reproduction, as one page.
+    """Write the thesis' tables, figures and tests next to those of a reproduction, as one page.
 
-    Runs that are missing are left out and named; the page can be made while runs go on.
+    Runs that are missing are left out and named; the page can be made while runs continue.
 
     Args:
         runs: folder of a reproduction, with record.parquet or record.csv.

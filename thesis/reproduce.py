@@ -43,7 +43,7 @@ class ThesisPlan(plan.Plan):
         return asdict(self.protocol)
 
     def simulate(self, *, progress: bool) -> Dataset:
-        """Hopper, as the protocol says."""
+        """Hopper, as in the protocol."""
         return self.protocol.simulate(progress=progress)
 
     def parts(self, recorded: Dataset, run: plan.Run) -> plan.Parts:
@@ -55,11 +55,11 @@ class ThesisPlan(plan.Plan):
         return Scaler.fit(self.protocol.scaler, recorded)
 
     def model_config(self, label: str) -> ModelConfig:
-        """As the protocol says."""
+        """See the protocol."""
         return self.protocol.model_config(label)
 
     def train_config(self, run: plan.Run) -> TrainConfig:
-        """As the protocol says."""
+        """See the protocol."""
         return self.protocol.train_config(cast(Run, run))
 
     def steps(self, run: plan.Run) -> int:
@@ -92,7 +92,7 @@ class ThesisPlan(plan.Plan):
 
 
 def provenance_here() -> dict[str, str]:
-    """What makes runs in this process, as it stood when it was first asked."""
+    """Provenance of this process at the first call."""
     if not _HERE:
         found = provenance(fingerprint())
         _HERE.update({("kernel_body" if k == "scan_backend" else k): v for k, v in found.items()})

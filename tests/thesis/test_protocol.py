@@ -125,7 +125,7 @@ def test_windows_masks_and_split_of_a_repeat_are_equal_for_all_its_models():
 
 
 @pytest.mark.parametrize("fraction", FULL.observed_fractions)
-def test_parts_are_70_15_15_and_exactly_the_asked_share_of_rows_stays(fraction):
+def test_parts_are_70_15_15_and_exactly_the_asked_fraction_of_rows_stays(fraction):
     small = replace(FULL, n_trajectories=40, recorded_rows=210)
     run = select(small.runs(), f"experiment=2,fraction={fraction},repeat=3,model=gru")[0]
     parts = small.cut(small.simulate(progress=False), run)

@@ -111,7 +111,7 @@ def test_a_claim_of_where_a_difference_is_needs_a_difference(outcomes, expected)
     assert findings._exactly(outcomes) == expected
 
 
-def test_models_that_need_the_same_epochs_are_not_told_apart():
+def test_models_that_need_the_same_epochs_do_not_differ_significantly():
     record = made.synthetic(repeats=4, epochs=2, fractions=thesis.FRACTIONS, experiments=(2,))
     flat = {**record.curves, "validation_honest_mse": np.ones(len(record.curves["epoch"]))}
     record = Record(record.runs, flat, "flat")
@@ -139,7 +139,7 @@ def test_the_thesis_rule_names_the_better_model():
     assert all("finds ODE-RNN better" in said for said in verdict.evidence)
 
 
-def test_not_being_told_apart_is_no_proof():
+def test_no_significant_difference_is_no_proof():
     same = made.HONEST["gru"] / made.HONEST["gru_d"]
     verdict = findings.no_difference(pairing.family(of(gru_d=same), "plain", "honest"))
     assert verdict.word == NOT_CONTRADICTED

@@ -1,4 +1,4 @@
-"""The report as a whole: its files, its page, and what a browser makes of it."""
+"""The report as a whole: its files, its page, and its rendering in a browser."""
 
 import csv
 import json

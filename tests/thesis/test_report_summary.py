@@ -270,10 +270,10 @@ def test_what_is_left_is_judged_by_what_an_epoch_has_taken():
     # Without a word of the engine: 900 s of runs in the 15 minutes before the last end.
     alone = circumstances.time_left(timed, Circumstances())
     assert alone.at_a_time == pytest.approx(900 / circumstances.wall_hours(timed) / 3600)
-    facts = dict(circumstances.time_rows(timed, Circumstances(engines=("2 processes of x",))))
-    assert facts["Still to run (estimate)"].startswith("374 runs, about ")
-    assert "at 2 runs at a time" in facts["Still to run (estimate)"]
-    assert "no run yet of GRU-D" in facts["Basis of the estimate"]
+    found = dict(circumstances.time_rows(timed, Circumstances(engines=("2 processes of x",))))
+    assert found["Still to run (estimate)"].startswith("374 runs, about ")
+    assert "at 2 runs at a time" in found["Still to run (estimate)"]
+    assert "no run yet of GRU-D" in found["Basis of the estimate"]
 
 
 def test_a_whole_record_has_nothing_left_to_estimate(contents):
@@ -292,8 +292,8 @@ def test_several_sessions_of_several_processes_are_added_up(tmp_path):
     (tmp_path / "sessions.json").write_text(json.dumps(sessions))
     known = Circumstances.of(tmp_path)
     assert (known.sessions, known.sessions_s, known.processes) == (3, 6000.0, 2)
-    facts = dict(circumstances.time_rows(made.synthetic(repeats=1, epochs=2), known))
-    assert facts["Wall time of all sessions"] == "100 min, 3 sessions"
+    found = dict(circumstances.time_rows(made.synthetic(repeats=1, epochs=2), known))
+    assert found["Wall time of all sessions"] == "100 min, 3 sessions"
 
 
 # --- files ----------------------------------------------------------------------------------------

@@ -325,8 +325,8 @@ def test_the_distance_from_the_thesis_is_in_its_standard_deviations(record):
     cell = block["ODE-RNN"][3]
     assert cell.value == pytest.approx((rmse(record, "ode_rnn", 0.3).mean() - 0.1019) / 0.0006)
     assert cell.bold == (abs(cell.value) <= 2)
-    facts = dict(table.blocks[1].rows)
-    assert [c.value for c in facts["Mean square of row 0, c"]] == pytest.approx([made.CONSTANT] * 4)
+    found = dict(table.blocks[1].rows)
+    assert [c.value for c in found["Mean square of row 0, c"]] == pytest.approx([made.CONSTANT] * 4)
 
 
 def test_the_constant_that_is_needed_gives_the_mean_of_the_thesis(record):

@@ -121,7 +121,7 @@ def test_published_and_rows_1_99_differ_by_the_constant_of_the_hidden_first_rows
     assert any(row["hidden_rows_0_share"] > 0 for row in rows)
 
 
-def test_the_models_of_a_repeat_are_scored_on_the_same_cells(done):
+def test_the_models_of_a_repeat_are_scored_on_the_same_values(done):
     rows = [r for r in Record.read(done).runs.values() if r["experiment"] == 2]
     for repeat in (0, 1):
         same = {
@@ -530,10 +530,10 @@ def test_two_experiments_in_one_folder_are_refused(tmp_path):
 def test_a_finished_run_is_left_alone(done, tmp_path):
     out = copied(done, tmp_path)
     run = SMALL.runs()[0]
-    facts = json.loads((out / "data" / "recorded.json").read_text(encoding="utf-8"))
+    record = json.loads((out / "data" / "recorded.json").read_text(encoding="utf-8"))
     recorded = out / "data" / "recorded.parquet"
     task = execution.Task(
-        run, ThesisPlan(SMALL), recorded, facts["fingerprint"], out / "runs" / run.run_id
+        run, ThesisPlan(SMALL), recorded, record["fingerprint"], out / "runs" / run.run_id
     )
     before = (task.folder / "scores.json").stat().st_mtime_ns
     task.perform()

@@ -33,7 +33,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What stands beside a record in its folder.
+    """Further files in the folder of a record.
 
     Attributes:
         protocol: the fields of the protocol; empty where the folder has none.
@@ -55,7 +55,7 @@ class Circumstances:
     def of(cls, folder: str | Path) -> Circumstances:
         """Reads `protocol.json` and `sessions.json`, or `about.json` of a published record.
 
-        What is missing or damaged is left out: the record stands without it.
+        Missing or damaged files are left out: the record is complete without them.
         """
         folder = Path(folder)
         about = _mapping(_json(folder / "about.json"))
@@ -90,7 +90,7 @@ class Circumstances:
 
     @property
     def processes(self) -> int | None:
-        """Runs at a time of the last session, where its engine says so."""
+        """Number of parallel runs of the last session, if its engine records it."""
         found = re.match(r"(\d+) process", self.engines[-1]) if self.engines else None
         return int(found[1]) if found and int(found[1]) else None
 
@@ -167,7 +167,7 @@ def broken_pairs(record: Record) -> tuple[str, ...]:
     """A sentence for each repeat whose models did not see the same test part.
 
     Models of a repeat share windows, masks and split, so that the last-value predictor scores the
-    same to the last bit beside each of them. Where it does not, no paired test is right.
+    same for each of them, exactly. Where it does not, paired tests are invalid.
     """
     said = []
     for fraction in thesis.FRACTIONS:
@@ -239,7 +239,7 @@ def time_left(record: Record, circumstances: Circumstances) -> TimeLeft | None:
 
 
 def time_rows(record: Record, circumstances: Circumstances) -> list[tuple[str, str]]:
-    """Time and its split, as names and values; for a part of the protocol, what is left."""
+    """Time and its parts, as names and values; for an incomplete record, the remaining time."""
     seconds = record.runs["seconds"].astype(float)
     rows = [("Runs", f"{len(record)}"), ("Sum of the run times", hours(seconds.sum()))]
     for experiment in (1, 2):

@@ -38,7 +38,7 @@ class Contents:
     Args:
         record: finished runs.
         illustrations: recordings and hidden states, or None.
-        circumstances: what stood beside the record.
+        circumstances: further files of the record's folder.
         repeats: of experiment 2 in the full protocol.
     """
 
@@ -80,7 +80,7 @@ class Contents:
 
     @cached_property
     def spreads(self) -> Mapping[str, tuple[stability.Spread, ...]]:
-        """The spread of ODE-GRU-D beside that of the others, by scoring."""
+        """The spread of ODE-GRU-D and of the other models, by scoring."""
         return {scoring: stability.spreads(self.record, scoring) for scoring in findings.SCORINGS}
 
     @cached_property

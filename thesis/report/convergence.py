@@ -110,7 +110,7 @@ def _trends(record: Record, scoring: str) -> list[str]:
 
 
 def _overtaking(record: Record, scoring: str) -> list[str]:
-    """When ODE-GRU-D is as good as ODE-RNN becomes in the same repeat, in a sentence."""
+    """A sentence on the epoch at which ODE-GRU-D reaches the final error of ODE-RNN."""
     said = []
     for fraction in thesis.FRACTIONS:
         ours, other = (curves_of(record, 2, model, fraction, scoring) for model in (_OURS, _OTHER))

@@ -1,4 +1,4 @@
-"""The order of the page: what stands where, and the sentences between."""
+"""The order of the page, and the sentences between its parts."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ def _boxes(axes: Axes, samples: dict[str, NDArray[np.float64]]) -> None:
             zorder=3,
         )
     axes.set_yticks(range(len(names)), [style_of(name).label for name in names])
-    axes.set_ylim(len(names) - 0.25, -0.6)  # room for what is drawn below a box
+    axes.set_ylim(len(names) - 0.25, -0.6)  # room for text below a box
     axes.grid(False, axis="y")
     axes.tick_params(axis="y", length=0)
     axes.locator_params(axis="x", nbins=4)

@@ -99,7 +99,7 @@ def curves_figure(record: Record, fraction: float) -> Figure:
 
 
 def _top(curves: Iterable[Mapping[str, NDArray[np.float64]]], column: str) -> float | None:
-    """Where a panel ends: what is above in the first epochs would press all else together."""
+    """Upper limit of a panel; large errors of the first epochs would compress the rest."""
     found = [curve[column] for curve in curves]
     if min(map(len, found)) < 10 * _CUT:
         return None

@@ -1,4 +1,4 @@
-"""What holds and what does not: sentences made of test results, none of them written by hand."""
+"""Sentences on which claims hold, derived from test results."""
 
 from __future__ import annotations
 
@@ -118,9 +118,9 @@ def judged(
     """The verdict on a claim of several parts.
 
     Args:
-        asked: how many parts it has.
+        asked: number of its parts.
         tested: how many of them the record lets us test.
-        right: how many tests bear it out.
+        right: number of tests that support it.
         wrong: how many contradict it.
         evidence: sentences.
         parts: what they are called.
@@ -173,7 +173,7 @@ def _exactly(outcomes: Sequence[tuple[bool, bool, bool]]) -> tuple[int, int]:
     """Parts borne out and contradicted of a claim that a difference is there or is not.
 
     A test that finds nothing contradicts no claim of a difference: it may be too weak. Nor does it
-    bear out that there is none, unless the same tests find a difference elsewhere.
+    support that there is none, unless the same tests find a difference elsewhere.
 
     Args:
         outcomes: per part, whether a difference is claimed, the first model is better, is worse.

@@ -1,4 +1,4 @@
-"""One HTML page that holds everything: no script, no request, light and dark, wide and narrow."""
+"""One self-contained HTML page without scripts and requests, light and dark, wide and narrow."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Picture:
     wide: bool = False
 
     def __post_init__(self) -> None:
-        # Laid out once: every file of it looks alike, and layout is most of the work.
+        # The layout is computed once for all files, because it takes most of the time.
         self.figure.draw_without_rendering()
         self.figure.set_layout_engine("none")
 

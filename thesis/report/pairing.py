@@ -81,12 +81,12 @@ class Pair:
 
     @property
     def better(self) -> bool:
-        """The first is lower, and the corrected paired t test says so."""
+        """Whether the first is significantly lower by the corrected paired t test."""
         return self.significant and self.result is not None and self.result.difference.value < 0
 
     @property
     def worse(self) -> bool:
-        """The first is higher, and the corrected paired t test says so."""
+        """Whether the first is significantly higher by the corrected paired t test."""
         return self.significant and self.result is not None and self.result.difference.value > 0
 
     @property

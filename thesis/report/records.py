@@ -15,7 +15,7 @@ from thesis.record import CURVE_COLUMNS, GROUP, RUN_COLUMNS
 from thesis.record import Record as RowRecord
 
 PROVENANCE = ("commit", *GROUP)
-"""What the runs of one record should share; where they do not, the page says so."""
+"""Properties that the runs of one record should share; the page marks differences."""
 
 _MAY_BE_NAN = ("honest_hidden_mse", "last_value_honest_hidden_mse", "validation_published_mse")
 """A run without masked rows, or without a validation part, has none."""
@@ -34,7 +34,7 @@ class Record:
         source: where it was read from, for messages.
 
     Raises:
-        InputError: a column is missing or of another length, a run stands twice, or a number is
+        InputError: a column is missing or of another length, a run occurs twice, or a number is
             out of its range; the message says in which run.
     """
 
@@ -93,7 +93,7 @@ class Record:
         inside = len(path.parts) > 1 and not path.is_absolute() and ".." not in path.parts
         return path.as_posix() if inside else ""
 
-    # --- what is asked of it ----------------------------------------------------------------------
+    # --- queries ----------------------------------------------------------------------------------
 
     def where(
         self,
@@ -102,7 +102,7 @@ class Record:
         model: str | None = None,
         fraction: float | None = None,
     ) -> NDArray[np.int64]:
-        """Rows of the runs that are asked for, by repeat.
+        """Rows of the selected runs, by repeat.
 
         Args:
             experiment: 1 or 2.
@@ -125,7 +125,7 @@ class Record:
         return self.runs[column][rows]
 
     def rmse(self, scoring: str, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Root of a run's mean squared error; `scoring` may begin with `last_value_`."""
+        """Root of a run's mean squared error; `scoring` may start with `last_value_`."""
         mse: NDArray[np.float64] = self.runs[f"{scoring}_mse"][rows].astype(float)
         return np.sqrt(mse)
 
@@ -163,7 +163,7 @@ def read_record(path: str | Path) -> Record:
 
     Args:
         path: folder with `record.parquet` or `record.csv`, and `curves.parquet` or `curves.csv`.
-            Where both forms stand, Parquet is read. Curves may be missing.
+            Parquet is preferred to CSV. Curves may be missing.
 
     Raises:
         FileFormatError: there is no record, or a file cannot be read.

@@ -32,7 +32,7 @@ class ReportFiles:
         summary: the answers as a Markdown document.
         tables: CSV, Markdown and LaTeX of each table.
         figures: PNG and PDF of each figure.
-        messages: what is not there, and why.
+        messages: missing parts, and why.
     """
 
     page: Path
@@ -69,9 +69,9 @@ def write_report(
     repeats: int | None = None,
     summary: str | Path | None = None,
 ) -> ReportFiles:
-    """Writes the thesis' tables, figures and tests beside ours, as one page and as files.
+    """Writes the thesis' tables, figures and tests next to ours, as one page and as files.
 
-    Runs that are missing, and numbers whose runs were not made alike, are marked where they stand.
+    Missing runs, and numbers whose runs have different provenance, are marked.
     Nothing else in `out` is touched.
 
     Args:
@@ -83,7 +83,7 @@ def write_report(
         summary: where to write the Markdown document in place of `summary.md` in `out`.
 
     Returns:
-        The files, and what is not there.
+        The files, and missing parts.
 
     Raises:
         FileFormatError: there is no record, or a file is damaged.

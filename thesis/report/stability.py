@@ -20,13 +20,13 @@ _OURS = "ode_gru_d"
 
 @dataclass(frozen=True)
 class Spread:
-    """The spread of ODE-GRU-D beside that of another model at one observed fraction.
+    """The spread of ODE-GRU-D and of another model at one observed fraction.
 
     Attributes:
         model: the other one.
         fraction: observed fraction of the rows.
         scoring: of the RMSE.
-        result: a ratio below 1 says that ODE-GRU-D is steadier; None where it cannot be tested.
+        result: with a ratio below 1, ODE-GRU-D varies less; None where it cannot be tested.
         p: of Pitman and Morgan's test, corrected by Holm over the observed fractions and the models
             of the thesis, or those that it does not have.
         missing: why there is no result.
@@ -122,7 +122,7 @@ def _spread_sentence(one: Spread) -> str:
 
 
 def spread_table(record: Record, found: Mapping[str, tuple[Spread, ...]], *, number: str) -> Table:
-    """Standard deviation of the test RMSE over repeats, and ODE-GRU-D's beside each.
+    """Standard deviation of the test RMSE over repeats, and the ratio of ODE-GRU-D's to each.
 
     Args:
         record: its runs of experiment 2.

@@ -34,7 +34,7 @@ def dark_style() -> str:
 
 
 def to_svg(figure: Figure, name: str) -> str:
-    """The figure as text; text in it is drawn as paths, so that it looks alike everywhere.
+    """The figure as SVG; text is drawn as paths, so that it looks the same everywhere.
 
     Args:
         figure: to draw.
@@ -52,7 +52,7 @@ def to_svg(figure: Figure, name: str) -> str:
 
 
 def image(figure: Figure, name: str, alt: str) -> str:
-    """An `img` element that holds the whole figure and needs nothing from outside."""
+    """A self-contained `img` element of the figure."""
     data = base64.b64encode(to_svg(figure, name).encode("utf-8")).decode("ascii")
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     return (

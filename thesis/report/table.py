@@ -1,4 +1,4 @@
-"""A table as a value, and what it becomes: CSV, Markdown, LaTeX, HTML."""
+"""A table as a value, and its formats: CSV, Markdown, LaTeX, HTML."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from offbeat.errors import InputError
 from offbeat.tables import DASH, escape_latex, latex, markdown
 
 MIXED = "†"
-"""Marks a number whose runs were not made alike: code, processor, scan backend, torch, data."""
+"""Marks a number whose runs differ in code, processor, scan backend, torch or data."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Cell:
         value: the number behind the text, or None.
         spread: its standard deviation, or None.
         n: number of runs behind it, or None.
-        bold: the best of its column, or what the note of the table says.
-        mark: stands raised behind the text.
+        bold: whether it is the best of its column, or see the note of the table.
+        mark: superscript after the text.
     """
 
     text: str = DASH
@@ -165,7 +165,7 @@ class Table:
 def bold_lowest(
     rows: Sequence[tuple[str, Sequence[Cell]]],
 ) -> tuple[tuple[str, tuple[Cell, ...]], ...]:
-    """Sets the lowest number of each column in bold; all that print alike, where several do.
+    """Sets the lowest number of each column in bold, and all that are printed equally.
 
     A column in which a number is missing has no best one.
     """

@@ -59,7 +59,7 @@ def mean_cell(
     digits: int,
     expected: int = 1,
 ) -> Cell:
-    """Mean and standard deviation of some runs; says so where runs are missing.
+    """Mean and standard deviation of some runs; notes missing runs.
 
     Args:
         record: of the runs.
@@ -103,7 +103,7 @@ def by_fraction(
         number: of the table.
         caption: a sentence, without the number.
         blocks: rows with a cell per fraction, in the order of `PERCENTS`.
-        said: notes, after which come those that every table has.
+        said: notes, followed by those of every table.
         head: of the first column.
     """
     return Table(number, caption, head, PERCENTS, tuple(blocks), notes(record, blocks, *said))
@@ -180,7 +180,7 @@ def _epochs(record: Record, model: str, fraction: float, scoring: str) -> list[C
 
 
 def _distinct_draws(record: Record, fraction: float) -> NDArray[np.int64]:
-    """One run per draw of windows and masks: models share a draw, and so its last value."""
+    """One run per draw of windows and masks: models of a draw have the same last value."""
     runs = record.where(experiment=1, fraction=fraction)
     runs = runs[np.isin(record.values("model", runs), thesis.MODELS)]
     _, first = np.unique(record.values("seed_draw", runs), return_index=True)

@@ -47,8 +47,8 @@ def all_models_table(record: Record, *, repeats: int, number: str) -> Table:
 def distance_table(record: Record, *, number: str) -> Table:
     """How far each cell of table 3.6 is from ours, in the thesis' standard deviations.
 
-    Below stands the constant of row 0 in our draw: the published scoring contains it, and it
-    follows from the draw, not from a model. Last comes the constant at which our mean would be the
+    Below is the constant of row 0 in our draw: the published scoring contains it, and it
+    depends on the draw, not on a model. The last row is the constant at which our mean would be the
     thesis' own, nothing else changed.
     """
     rows, needed = [], []
@@ -106,7 +106,7 @@ def distance_table(record: Record, *, number: str) -> Table:
 def _constants_needed(record: Record, model: str) -> tuple[Cell, ...]:
     """The c of which `0.99 rows_1_99 + c fraction / 100` would have the thesis' mean RMSE.
 
-    A dash where there is none: the rest alone is above it, or no row 0 is masked in some run.
+    A dash where there is none: the rest is above it, or no row 0 is masked in some run.
     """
     from scipy.optimize import brentq
 
