@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -172,9 +171,6 @@ class Gaussian(Head):
             return each.mean()
         return (each * mask).sum() / mask.sum().clamp_min(1)
 
-
-HALF_LOG_2_PI = 0.5 * math.log(2 * math.pi)
-"""The constant per entry that `Gaussian.loss` omits from the negative log-likelihood."""
 
 HEADS: Registry[type[Head]] = Registry("head", group="offbeat.heads")
 """Heads by the name that `ModelConfig.head` takes."""
