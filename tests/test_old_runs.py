@@ -2,10 +2,12 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
+import offbeat as ob
 from offbeat.cli.app import main
 
 
@@ -34,3 +36,12 @@ def test_a_run_of_0_1_0_still_predicts_fills_and_scores(tmp_path, capsys):
         assert got == pytest.approx(was["honest"]["rmse"], rel=1e-5)
     for name, rmse in then["imputation"]["rmse_scaled"].items():
         assert scores["imputation"]["rmse_scaled"][name] == pytest.approx(rmse, rel=1e-5)
+
+
+def test_runs_of_0_1_0_on_other_data_are_of_another_condition(tmp_path):
+    for name, data in (("a", "f00d"), ("b", "f00d"), ("c", "beef")):
+        shutil.copytree(Path(__file__).parent / "data" / "run_0_1_0" / "run", tmp_path / name)
+        split = json.loads((tmp_path / name / "parts.json").read_text())
+        (tmp_path / name / "parts.json").write_text(json.dumps({**split, "data": data}))
+    a, b, c = (ob.read_runs(tmp_path / name)[0].condition for name in "abc")
+    assert a == b != c

@@ -288,6 +288,8 @@ def _difference(then: Any, now: Any) -> str:
         one_is_missing = then is None or now is None
         return f" ({'none' if then is None else 'one'} then)" if one_is_missing else ""
     keys = [key for key in now if then.get(key) != now[key]]
+    if "name" in keys:  # of another model, all else differs as well
+        keys = ["name"]
     short = [key for key in keys if key != "fingerprint" and not isinstance(now[key], list)]
     if keys == ["fingerprint"]:
         return " (the same size, other values, times, masks or order)"

@@ -109,9 +109,9 @@ def _read_folder(folder: Path) -> RawRun:
         scores, name = results["predictors"], str(model["name"])
         draw = str(split.pop("seed"))
         condition = {"data": Path(config["data"]).name, **split, "scaler": config["scaler"]}
-        fingerprint = folder / "split.json"
-        if fingerprint.is_file():
-            condition["fingerprint"] = str(_load(fingerprint, json.loads)["data"])
+        for path in (folder / "split.json", folder / "parts.json"):  # the second is of 0.1.0
+            if path.is_file():
+                condition["fingerprint"] = str(_load(path, json.loads)["data"])[:12]
         settings = {
             f"{part}.{key}": value
             for part, values in (("model", model), ("training", training))
