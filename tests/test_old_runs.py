@@ -43,5 +43,5 @@ def test_runs_of_0_1_0_on_other_data_are_of_another_condition(tmp_path):
         shutil.copytree(Path(__file__).parent / "data" / "run_0_1_0" / "run", tmp_path / name)
         split = json.loads((tmp_path / name / "parts.json").read_text())
         (tmp_path / name / "parts.json").write_text(json.dumps({**split, "data": data}))
-    a, b, c = (ob.read_runs(tmp_path / name)[0].condition for name in "abc")
+    a, b, c = (run.condition for run in ob.read_runs([tmp_path / name for name in "abc"]))
     assert a == b != c
