@@ -39,9 +39,9 @@ def test_a_run_of_0_1_0_still_predicts_fills_and_scores(tmp_path, capsys):
 
 
 def test_runs_of_0_1_0_on_other_data_are_of_another_condition(tmp_path):
-    for name, data in (("a", "f00d"), ("b", "f00d"), ("c", "beef")):
+    for name, data in (("a", "f00d"), ("b", "beef")):
         shutil.copytree(Path(__file__).parent / "data" / "run_0_1_0" / "run", tmp_path / name)
         split = json.loads((tmp_path / name / "parts.json").read_text())
         (tmp_path / name / "parts.json").write_text(json.dumps({**split, "data": data}))
-    a, b, c = (run.condition for run in ob.read_runs([tmp_path / name for name in "abc"]))
-    assert a == b != c
+    a, b = (run.condition for run in ob.read_runs([tmp_path / name for name in "ab"]))
+    assert (a[-4:], b[-4:]) == ("f00d", "beef")
