@@ -113,3 +113,8 @@ def test_roles_are_saved_with_the_model(tmp_path):
     model = small_model("gru", arm(3))
     model.save(tmp_path / "model")
     assert ob.load_model(tmp_path / "model").roles == ROLES
+
+
+def test_data_with_nothing_to_predict_is_refused():
+    with pytest.raises(ob.InputError, match="every channel is exogenous"):
+        ob.make_model("gru", arm(3, roles=("exogenous",) * 3))

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from offbeat.config import ModelConfig, Recipe, TrainConfig, from_mapping
-from offbeat.data.batch import Batch
+from offbeat.data.batch import EXOGENOUS, Batch
 from offbeat.data.scaler import Scaler, ScalerKind, check_observed
 from offbeat.data.trajectory import Dataset
 from offbeat.data.transforms import Transforms
@@ -289,6 +289,10 @@ def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
             f"the scaler has {len(scaler.shift)} channels, the data has {train.channels}"
         )
     batch = Batch.of(train, scaler=scaler)
+    if all(role == EXOGENOUS for role in batch.roles):
+        raise InputError(
+            "every channel is exogenous, so there is nothing to predict; give one the role 'state'"
+        )
     return DataInfo(
         train.names,
         train.units,
