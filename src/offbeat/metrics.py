@@ -86,15 +86,17 @@ class Scores:
         return result
 
 
-def _plain(score: Score) -> dict[str, Any]:
-    def number(value: float) -> float | None:
-        return None if value != value else value
+def null_if_nan(value: float) -> float | None:
+    """A number for JSON, which has no NaN."""
+    return None if value != value else value
 
+
+def _plain(score: Score) -> dict[str, Any]:
     return {
-        "mse": number(score.mse),
-        "rmse": number(score.rmse),
+        "mse": null_if_nan(score.mse),
+        "rmse": null_if_nan(score.rmse),
         "count": score.count,
-        "per_channel_mse": [number(v) for v in score.per_channel],
+        "per_channel_mse": [null_if_nan(v) for v in score.per_channel],
     }
 
 

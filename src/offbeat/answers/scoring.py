@@ -19,7 +19,7 @@ from offbeat.baselines import fill, fillers, forecast, forecasters
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
-from offbeat.metrics import gap_groups
+from offbeat.metrics import gap_groups, null_if_nan
 from offbeat.models.base import BaseModel
 
 OVERALL = "all, scaled"
@@ -98,10 +98,10 @@ class ChannelScores:
             "counts": dict(zip(self.names, self.counts, strict=True)),
             "units": dict(zip(self.names, self.units, strict=True)),
             "rmse_in_units": {
-                predictor: dict(zip(self.names, map(_plain, values), strict=True))
+                predictor: dict(zip(self.names, map(null_if_nan, values), strict=True))
                 for predictor, values in self.rmse.items()
             },
-            "rmse_scaled": {name: _plain(value) for name, value in self.overall.items()},
+            "rmse_scaled": {name: null_if_nan(value) for name, value in self.overall.items()},
             "verdict": self.verdict(),
         }
 
@@ -360,10 +360,6 @@ def _targets(trajectory: Trajectory, horizon: float, count: int) -> list[_Target
         )
         for row in possible[np.unique(np.rint(spread).astype(int))]
     ]
-
-
-def _plain(value: float) -> float | None:
-    return None if value != value else value
 
 
 def _shown(value: float) -> str:

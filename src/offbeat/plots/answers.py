@@ -9,8 +9,8 @@ import numpy as np
 
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Trajectory
-from offbeat.errors import InputError, one_of
-from offbeat.plots.style import RC, STYLES, style_of
+from offbeat.plots.figures import channel_panels
+from offbeat.plots.style import STYLES, style_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,26 +41,7 @@ def answers(
     Raises:
         InputError: no channel is given, or one that a trajectory lacks.
     """
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    if not channels:
-        raise InputError(f"name at least one channel to draw, of: {', '.join(truth.names)}")
-    for trajectory in (truth, *answered.values()):
-        for name in channels:
-            one_of("channel", name, trajectory.names)
-    with rc_context(RC):
-        figure = Figure(figsize=(7.0, 0.9 + 1.6 * len(channels)), layout="constrained")
-        panels = figure.subplots(len(channels), sharex=True, squeeze=False)[:, 0]
-        for axes, name in zip(panels, channels, strict=True):
-            _channel(axes, truth, answered, name)
-        panels[-1].set_xlabel("Time (s)")
-        figure.align_ylabels(panels)
-        if title:
-            figure.suptitle(title, fontsize=9.5)
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
-    return figure
+    return channel_panels(_channel, truth, answered, channels, title=title, height=1.6)
 
 
 def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], name: str) -> None:

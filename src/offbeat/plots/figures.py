@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -118,19 +118,44 @@ def predictions(
     Raises:
         InputError: no channel is given, or one that a trajectory lacks.
     """
+    return channel_panels(_channel, truth, predictions, channels, title=title, height=1.45)
+
+
+def channel_panels(
+    draw: Callable[[Axes, Trajectory, Mapping[str, Trajectory], str], None],
+    truth: Trajectory,
+    predicted: Mapping[str, Trajectory],
+    channels: Sequence[str],
+    *,
+    title: str,
+    height: float,
+) -> Figure:
+    """Draws a panel per channel, with one legend.
+
+    Args:
+        draw: draws a channel, by its name, into the axes of its panel.
+        truth: passed to `draw`.
+        predicted: passed to `draw`.
+        channels: names of the channels to draw.
+        title: text above the panels.
+        height: of a panel, in inches.
+
+    Raises:
+        InputError: no channel is given, or one that a trajectory lacks.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     if not channels:
         raise InputError(f"name at least one channel to draw, of: {', '.join(truth.names)}")
-    for trajectory in (truth, *predictions.values()):
+    for trajectory in (truth, *predicted.values()):
         for name in channels:
             one_of("channel", name, trajectory.names)
     with rc_context(RC):
-        figure = Figure(figsize=(_WIDTH, 0.9 + 1.45 * len(channels)), layout="constrained")
+        figure = Figure(figsize=(_WIDTH, 0.9 + height * len(channels)), layout="constrained")
         panels = figure.subplots(len(channels), sharex=True, squeeze=False)[:, 0]
         for axes, name in zip(panels, channels, strict=True):
-            _channel(axes, truth, predictions, name)
+            draw(axes, truth, predicted, name)
         panels[-1].set_xlabel("Time (s)")
         figure.align_ylabels(panels)
         if title:
