@@ -204,7 +204,7 @@ def test_a_run_can_be_trained_for_longer_and_ends_as_one_that_was_planned_so(tmp
         config = ob.TrainConfig(epochs=epochs, batch_size=4)
         ob.fit(longer, TRAIN, config=config, out=tmp_path, progress=False)
     assert same(weights(planned), weights(longer))
-    with pytest.raises(ob.InputError, match="3 epochs already, 2 were asked for"):
+    with pytest.raises(ob.InputError, match="3 epochs already, 2 were requested"):
         ob.fit(
             ob.make_model("gru", TRAIN, **SMALL), TRAIN,
             config=ob.TrainConfig(epochs=2, batch_size=4), out=tmp_path, progress=False,

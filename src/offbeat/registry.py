@@ -16,13 +16,13 @@ class Registry(Mapping[str, T], Generic[T]):
     """Entries by name. Names are listed in the order in which they were registered.
 
     Packages add entries by calling `register`, or by an entry point of `group`, which is loaded
-    when a name is looked up that is not there, or when all names are asked for. An entry point is
+    when an unknown name is looked up, or when all names are listed. An entry point is
     a function without arguments that registers, or that returns the entry.
 
     Args:
-        what: what an entry is, for messages: `cell`, `reader`.
+        what: kind of the entries, for messages: `cell`, `reader`.
         group: of entry points, such as `offbeat.models`; None for a registry without.
-        adopt: makes an entry of what an entry point gives, or raises; by default it is one.
+        adopt: converts the result of an entry point to an entry, or raises; by default it is one.
 
     Example:
         >>> CELLS: Registry[type] = Registry("cell")
@@ -45,8 +45,8 @@ class Registry(Mapping[str, T], Generic[T]):
         """Adds an entry; returns it.
 
         Args:
-            name: what users say.
-            entry: what they get.
+            name: of the entry.
+            entry: its value.
             replace: allow a name that is taken.
 
         Raises:

@@ -1,4 +1,4 @@
-"""A training run: all of it that changes, how it is kept in a folder, and how it is resumed."""
+"""The state of a training run, its checkpoints in a folder, and how it is resumed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from offbeat.models.model import Model
 
 @dataclass(frozen=True)
 class EpochRecord:
-    """One line of the log.
+    """One row of the log.
 
     Attributes:
         epoch: counted from 1.
@@ -53,10 +53,10 @@ class EpochRecord:
 
 
 class FlatParameters:
-    """All parameters of a model as one, so that an optimizer's step is a few operations in all.
+    """All parameters of a model in one tensor, so that an optimizer's step is a few operations.
 
     Attributes:
-        flat: every parameter, in the order of `model.parameters()`; its gradient is theirs.
+        flat: every parameter, in the order of `model.parameters()`; shares their gradients.
     """
 
     def __init__(self, model: BaseModel) -> None:
@@ -73,11 +73,11 @@ class FlatParameters:
             at = end
 
     def zero_gradient(self) -> None:
-        """Before a step; what a backward pass finds is added in place."""
+        """Sets the gradient to 0 before a step; the backward pass adds to it in place."""
         self.gradient.zero_()
 
     def release(self) -> None:
-        """Gives each parameter its own memory again."""
+        """Restores separate memory for each parameter."""
         for p in self._own:
             p.data = p.data.clone()
             p.grad = None
@@ -85,10 +85,10 @@ class FlatParameters:
 
 @contextmanager
 def flat_parameters(model: BaseModel) -> Iterator[FlatParameters]:
-    """Lets a model's parameters lie in one piece while it is trained.
+    """Context manager that stores a model's parameters contiguously during training.
 
     Args:
-        model: whose parameters.
+        model: to train.
     """
     parameters = FlatParameters(model)
     try:
@@ -98,11 +98,11 @@ def flat_parameters(model: BaseModel) -> Iterator[FlatParameters]:
 
 
 class RunState:
-    """All of a training run that changes, beside the model: what a checkpoint must hold.
+    """The state of a training run without the model, for checkpoints.
 
     Args:
-        parameters: what the optimizer moves.
-        recipe: names the optimizer.
+        parameters: that the optimizer changes.
+        recipe: with the optimizer.
     """
 
     def __init__(self, parameters: FlatParameters, recipe: Recipe) -> None:
@@ -135,7 +135,7 @@ def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimize
 def identity_of(
     model: BaseModel, recipe: Recipe, train: Dataset, validation: Dataset | None
 ) -> dict[str, Any]:
-    """What must be the same for a run to be resumed: anything else would end in other numbers.
+    """The identity of a run, which must be equal to resume it.
 
     Args:
         model: before the first step.
@@ -156,19 +156,21 @@ def identity_of(
         "training": asdict(recipe),
         "train": _part(train),
         "validation": None if validation is None else _part(validation),
-        # These follow from the training set unless they were given.
+        # These depend on the training set unless they were given.
         "scaler": model.scaler.to_dict(),
         "statistics": model.statistics.to_dict(),
         "initial_weights": weights.hexdigest(),
     }
     if recipe.schedule == "constant":
         identity["training"].pop("epochs")  # such a run can be trained for longer
-    plain: dict[str, Any] = json.loads(json.dumps(identity))  # lists for tuples, as it is read back
+    plain: dict[str, Any] = json.loads(
+        json.dumps(identity)
+    )  # lists in place of tuples, as in the file
     return plain
 
 
 def _part(dataset: Dataset) -> dict[str, Any]:
-    """What is compared of a data set, from what a user sees at once to every bit."""
+    """The identity of a data set, from its channels to its fingerprint."""
     return {
         "channels": [f"{n} [{u}]" for n, u in zip(dataset.names, dataset.units, strict=True)],
         "trajectories": len(dataset),
@@ -187,15 +189,15 @@ _WORDS = {
     "train": "the trajectories of the training set",
     "validation": "the trajectories of the validation set",
 }
-"""What the parts of an identity are called in messages."""
+"""Names of the parts of an identity in messages."""
 
 
 def save_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str, Any]) -> None:
-    """Writes a checkpoint of a run, and then removes the one before.
+    """Writes a checkpoint of a run, and then removes the previous one.
 
     Args:
         folder: of the run.
-        model: in its present state.
+        model: in its current state.
         state: of its training.
         identity: from `identity_of`.
     """
@@ -226,16 +228,16 @@ def save_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str
 
 
 def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str, Any]) -> None:
-    """Takes up the last checkpoint of a run, if there is one.
+    """Resumes from the last checkpoint of a run, if there is one.
 
     Args:
         folder: of the run.
         model: gets the weights of the checkpoint.
-        state: gets all else.
+        state: gets the rest.
         identity: from `identity_of`.
 
     Raises:
-        InputError: the checkpoint is of a run that differs in what matters, or the folder holds
+        InputError: the checkpoint is of a run with another identity, or the folder contains
             something else.
         FileFormatError: the checkpoint is damaged.
     """
@@ -283,12 +285,12 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
 
 
 def _difference(then: Any, now: Any) -> str:
-    """What differs, as far as it can be said in a few words."""
+    """A short description of the difference."""
     if not isinstance(then, dict) or not isinstance(now, dict):
         one_is_missing = then is None or now is None
         return f" ({'none' if then is None else 'one'} then)" if one_is_missing else ""
     keys = [key for key in now if then.get(key) != now[key]]
-    if "name" in keys:  # of another model, all else differs as well
+    if "name" in keys:  # for another model, all else differs as well
         keys = ["name"]
     short = [key for key in keys if key != "fingerprint" and not isinstance(now[key], list)]
     if keys == ["fingerprint"]:
@@ -299,7 +301,7 @@ def _difference(then: Any, now: Any) -> str:
 
 
 def write_log(folder: Path, history: list[EpochRecord]) -> None:
-    """Writes `log.csv`, a line per epoch.
+    """Writes `log.csv`, a row per epoch.
 
     Args:
         folder: of the run.

@@ -1,4 +1,4 @@
-"""YAML from other people: bounds on what is read, whatever the text is."""
+"""Limits on YAML from untrusted sources."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any
 import yaml
 
 MOST_CHARACTERS, MOST_VALUES, DEEPEST = 200_000, 20_000, 20
-"""Bounds of a text: its length, its values once aliases are expanded, its nesting."""
+"""Limits of a text: its length, its values with expanded aliases, its nesting."""
 
 
 class UnsafeYAMLError(yaml.YAMLError):
-    """A text that would take all memory or stack."""
+    """A text beyond the limits."""
 
 
 def load(text: str) -> Any:
-    """Reads plain values from a text, within the bounds.
+    """Reads plain values from a text within the limits.
 
     Raises:
-        UnsafeYAMLError: it is beyond the bounds.
+        UnsafeYAMLError: it is beyond the limits.
         yaml.YAMLError: it is not YAML, or it names Python objects.
     """
     check(text)
@@ -26,7 +26,7 @@ def load(text: str) -> Any:
 
 
 def check(text: str) -> None:
-    """Refuses a text that is too large, nested too deeply, or too large once aliases are expanded.
+    """Raises an error for a text that is too large, also with expanded aliases, or too deep.
 
     Raises:
         UnsafeYAMLError: it is.
@@ -35,7 +35,7 @@ def check(text: str) -> None:
     if len(text) > MOST_CHARACTERS:
         raise UnsafeYAMLError(f"it is longer than {MOST_CHARACTERS} characters")
     depth = 0
-    for event in yaml.parse(text, yaml.SafeLoader):  # the one pass of PyYAML without recursion
+    for event in yaml.parse(text, yaml.SafeLoader):  # the only pass of PyYAML without recursion
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
@@ -46,7 +46,7 @@ def check(text: str) -> None:
 
 
 def check_value(value: Any) -> None:
-    """Refuses a value in which a text, should it be read as YAML, is one that `check` refuses.
+    """Raises an error for a value with a text that `check` refuses as YAML.
 
     Raises:
         UnsafeYAMLError: it is.
@@ -56,7 +56,7 @@ def check_value(value: Any) -> None:
             inside = load(value)
         except UnsafeYAMLError:
             raise
-        except (yaml.YAMLError, ValueError):  # then it is no YAML, but a name or a sentence
+        except (yaml.YAMLError, ValueError):  # not YAML, but a name or a sentence
             return
         if inside != value:
             check_value(inside)
@@ -69,9 +69,11 @@ def check_value(value: Any) -> None:
 
 
 def _count(node: yaml.Node, seen: dict[int, int]) -> int:
-    """The values in a node, those behind aliases counted each time."""
+    """The number of values in a node, with expanded aliases."""
     if id(node) not in seen:
-        seen[id(node)] = MOST_VALUES + 1  # until it is known; an alias to a node around it stays so
+        seen[id(node)] = (
+            MOST_VALUES + 1
+        )  # until it is known; remains so for an alias to a parent node
         inside: list[yaml.Node] = []
         if isinstance(node, yaml.SequenceNode):
             inside = node.value

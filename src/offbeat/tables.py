@@ -29,11 +29,11 @@ def plain(rows: Sequence[Row], *, left: Collection[int] = (0,)) -> str:
 
 
 def markdown(head: Row, rows: Iterable[Row], *, right: bool = False) -> str:
-    """A table as GitHub shows it.
+    """A table in Markdown.
 
     Args:
         head: of the columns.
-        rows: of as many texts.
+        rows: of the same number of texts.
         right: align all columns but the first to the right.
     """
     rule = "|---|" + ("---:|" if right else "---|") * (len(head) - 1)

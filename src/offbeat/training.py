@@ -1,4 +1,4 @@
-"""Training: `fit`, its log, its checkpoints, and what it does when killed or diverging."""
+"""Training: `fit`, its log and its checkpoints."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ Callback = Callable[[EpochRecord, BaseModel], bool | None]
 
 @dataclass(frozen=True)
 class FitResult:
-    """What `fit` did.
+    """The result of `fit`.
 
     Attributes:
         history: one record per epoch.
         stopped_early: True if `patience` or a callback ended the training.
-        folder: where log and checkpoints lie, or None.
-        recipe: how the model was trained.
+        folder: of log and checkpoints, or None.
+        recipe: training configuration that was used.
     """
 
     history: tuple[EpochRecord, ...]
@@ -57,7 +57,7 @@ class FitResult:
 
     @property
     def steps(self) -> int:
-        """Optimizer steps in all."""
+        """Total number of optimizer steps."""
         return self.history[-1].steps if self.history else 0
 
 
@@ -75,22 +75,22 @@ def fit(
     """Trains a model in place on one-step-ahead prediction.
 
     The loss is that of the model's head over the known values of all rows but the first, in scaled
-    units. Batches, their order and all random numbers follow from `config.seed` alone.
+    units. Batches, their order and all random numbers depend only on `config.seed`.
 
     Args:
         model: trained in place.
         train: the training set; masked values that are known serve as targets.
         validation: scored after each epoch.
-        config: what it leaves open, or all of it if None, is the recipe of the model.
+        config: fields that are None, or all of them if it is None, follow the model's recipe.
         out: folder for `log.csv`, checkpoints and the final `model`; a run that was stopped there
             is resumed, and ends bit for bit as if it had not been stopped.
-        device: such as `cpu` or `cuda`; by default where the model is. The model stays there.
+        device: such as `cpu` or `cuda`; by default that of the model. The model stays on it.
         callbacks: each is called with the record of an epoch and the model after that epoch; a true
             result stops the training.
         progress: show a progress bar.
 
     Returns:
-        The log, and where it lies.
+        The log, and its folder.
 
     Raises:
         InputError: data of other channels than the model, no validation set although `patience` or
@@ -123,7 +123,7 @@ def fit(
             if state.epoch > recipe.epochs:
                 raise InputError(
                     f"{folder} holds a run of {state.epoch} epochs already, {recipe.epochs} were "
-                    "asked for; give another folder"
+                    "requested; give another folder"
                 )
         return _fit(model, batch, validated, recipe, state, folder, identity, callbacks, progress)
 
@@ -177,7 +177,7 @@ def _fit(
 
 
 class ValidationSet:
-    """A data set that is scored again and again; its step inputs are computed once.
+    """A data set that is scored repeatedly; its step inputs are computed once.
 
     Args:
         model: its scales and statistics give the step inputs.
@@ -196,7 +196,7 @@ class ValidationSet:
         self.counted = empty.scores().after_first_observation.count
 
     def scores(self, model: BaseModel, *, seed: int = 0, gap_unit: float | None = None) -> Scores:
-        """Scores a model in its present state.
+        """Scores a model in its current state.
 
         Args:
             model: to score.
@@ -206,7 +206,7 @@ class ValidationSet:
         sums = ScoreSums(self.channels, gap_unit=gap_unit)
         with torch.inference_mode():
             for prepared, part in self.parts:
-                # The same numbers for each part, as if they were one batch.
+                # One generator for all parts, as if they were one batch.
                 generator = torch.Generator().manual_seed(seed) if model.needs_generator else None
                 sums.add(model.run(prepared, generator=generator).mean, part)
         return sums.scores()
@@ -217,7 +217,7 @@ def _whole(prepared: Any) -> Any:
 
 
 def validate(model: BaseModel, batch: Batch, *, seed: int = 0, size: int = 500) -> Scores:
-    """Scores a model on a scaled batch, a part at a time.
+    """Scores a model on a scaled batch, in parts.
 
     Args:
         model: to score.
@@ -233,7 +233,7 @@ def validate(model: BaseModel, batch: Batch, *, seed: int = 0, size: int = 500) 
 
 
 class Examples:
-    """A training set in memory, as a step takes it: nothing is computed again in each epoch.
+    """A training set in memory, with inputs that are computed once for all epochs.
 
     Args:
         model: its scales and statistics give the step inputs.
@@ -255,7 +255,7 @@ class Examples:
         """The model's loss of the one-step-ahead prediction of some trajectories.
 
         Args:
-            model: in its present state.
+            model: in its current state.
             index: (batch,) positions of the trajectories.
             generator: of self-feeding.
         """
@@ -335,7 +335,7 @@ def train_step(
     value = float(loss.detach())
     if not math.isfinite(value):
         raise DivergenceError(
-            f"the loss turned to {value} in epoch {state.epoch + 1}, step {state.step + 1}; the "
+            f"the loss is {value} in epoch {state.epoch + 1}, step {state.step + 1}; the "
             "last good checkpoint is kept: lower the learning rate, or clip gradients (clip_norm)"
         )
     state.parameters.zero_gradient()
@@ -364,7 +364,7 @@ def _close_epoch(
         and scores.after_first_row.count
     ):
         raise DivergenceError(
-            f"the validation MSE turned to {scores.after_first_row.mse} after epoch "
+            f"the validation MSE is {scores.after_first_row.mse} after epoch "
             f"{state.epoch + 1}; the last good checkpoint is kept: lower the learning rate, or "
             "clip gradients"
         )
@@ -391,7 +391,7 @@ def _close_epoch(
 def _check_weights(model: BaseModel, state: RunState) -> None:
     if not all(bool(torch.isfinite(p).all()) for p in model.parameters()):
         raise DivergenceError(
-            f"a weight left the finite numbers in epoch {state.epoch + 1}, step {state.step}; the "
+            f"a weight is not finite in epoch {state.epoch + 1}, step {state.step}; the "
             "last good checkpoint is kept: lower the learning rate, or clip gradients (clip_norm)"
         )
 
@@ -400,7 +400,7 @@ def _stopped(state: RunState, recipe: Recipe) -> bool:
     return recipe.patience is not None and state.epoch - state.best_epoch >= recipe.patience
 
 
-# --- what is shown ------------------------------------------------------------------------------
+# --- progress -----------------------------------------------------------------------------------
 
 
 def _tensorboard(folder: Path | None, state: RunState) -> Any:

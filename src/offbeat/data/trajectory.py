@@ -1,4 +1,4 @@
-"""Trajectories, which are checked when they are made, and data sets, which hold many."""
+"""Trajectories, and data sets of trajectories."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from offbeat.data.arrays import frozen, hand_over
 from offbeat.errors import InputError, one_of
 
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
-"""Units of time that input may be given in; inside, times are seconds."""
+"""Units of input times; internally, times are in seconds."""
 
 ROLES = ("state", "action", "exogenous")
-"""What a channel is to a model: a `state` is observed and predicted; an `action` is given, or
+"""Roles of channels: a `state` is observed and predicted; an `action` is given, or
 predicted and fed back; an `exogenous` channel is observed and never predicted."""
 
 
@@ -39,7 +39,7 @@ class Trajectory:
         names: one unique name per channel; by default `channel_0`, `channel_1`, ...
         units: one unit per channel, such as `rad/s`; by default empty.
         roles: one of `ROLES` per channel; by default `state`.
-        origin: where it came from, for messages and reports.
+        origin: source, for messages and reports.
 
     Raises:
         InputError: shapes disagree, times are not finite or do not increase, a value is infinite,
@@ -113,7 +113,7 @@ class Trajectory:
         """Makes a trajectory from times in any unit, integer clocks included.
 
         The first time of an integer clock, such as nanoseconds since 1970, is subtracted before
-        the clock becomes float64, so that nothing is lost to rounding.
+        the clock becomes float64, which avoids rounding errors.
 
         Args:
             times: (rows,) in `time_unit`.
@@ -229,7 +229,7 @@ def _check_times(times: NDArray[np.float64], where: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Dataset(Sequence[Trajectory]):
-    """Trajectories of the same channels, and what is known of how they were made.
+    """Trajectories of the same channels, with metadata.
 
     Args:
         trajectories: at least one, all with the same names, units and roles.
@@ -296,7 +296,7 @@ class Dataset(Sequence[Trajectory]):
         return replace(self, trajectories=tuple(self.trajectories[int(i)] for i in index))
 
     def fingerprint(self, version: int = 2) -> str:
-        """SHA-256 of names, units, roles, times, values and masks: equal for equal data alone.
+        """SHA-256 of names, units, roles, times, values and masks: equal only for equal data.
 
         Args:
             version: 1 gives the fingerprint of Offbeat 0.1.0, which leaves out units and actions.
