@@ -28,7 +28,7 @@ class ModelConfig:
         reset_after: GRU whose reset gate acts after the recurrent product, as in `torch.nn.GRU`,
             instead of before it, as in equation 22.
         vector_field: `mlp`, a neural ODE between observations (equation 36), `none`, or a vector
-            field of one's own.
+            registered field.
         field_units: hidden layers of the vector field.
         activation: nonlinearity of the vector field.
         solver: how the vector field is integrated over a gap: `euler`, `midpoint`, `heun`, `rk4`,
@@ -42,7 +42,7 @@ class ModelConfig:
         decay: `none`; `trainable`, the gamma_h of equation 26 from the times since observation of
             all channels; `vector` or `scalar`, exp(-tau gap) with one tau per unit or a single one
             (equation 42).
-        decay_rows: `continuous`, the decay is a function of time only, whatever the rows
+        decay_rows: `continuous`, the decay is a function of time only, for any rows
             at; `every_row`, gamma compounds at every row (the thesis' protocol);
             `observed_rows`, the state decays only where it is updated.
         input_decay: gamma_x, last values that decay to the training mean (equation 27).
@@ -52,7 +52,7 @@ class ModelConfig:
             `delta` since each channel's last observation (equation 25), `gap` since the row before,
             or `none`.
         time_input_unit: of that time: the median `gap` of training, or the `longest` time met
-            there, so that it is at most 1 in training. Times of many gaps are large beside the
+            there, so that it is at most 1 in training. Times of many gaps are large compared to the
             values, and can take longer to learn from.
         self_feeding: fraction of rows at which the cell's input is the model's decoded
             prediction in place of the observed values (one draw per row for the whole batch,

@@ -34,7 +34,7 @@ def writable(path: str | Path, *, folder: bool = False) -> Path:
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary file name beside `path`; renames it to `path` if the block succeeds.
+    """Yields a temporary name in the folder of `path`; renames it to `path` if the block succeeds.
 
     If the block raises or the process is killed, `path` does not change.
     """
@@ -56,7 +56,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary folder beside `path`; renames it to `path` if the block succeeds.
+    """Yields a temporary folder next to `path`; renames it to `path` if the block succeeds.
 
     A folder at `path` is replaced after the new one is complete.
     """

@@ -163,9 +163,8 @@ def identity_of(
     }
     if recipe.schedule == "constant":
         identity["training"].pop("epochs")  # such a run can be trained for longer
-    plain: dict[str, Any] = json.loads(
-        json.dumps(identity)
-    )  # lists in place of tuples, as in the file
+    # lists in place of tuples, as in the file
+    plain: dict[str, Any] = json.loads(json.dumps(identity))
     return plain
 
 

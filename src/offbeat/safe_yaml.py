@@ -71,9 +71,8 @@ def check_value(value: Any) -> None:
 def _count(node: yaml.Node, seen: dict[int, int]) -> int:
     """The number of values in a node, with expanded aliases."""
     if id(node) not in seen:
-        seen[id(node)] = (
-            MOST_VALUES + 1
-        )  # until it is known; remains so for an alias to a parent node
+        # until it is known; remains so for an alias to a parent node
+        seen[id(node)] = MOST_VALUES + 1
         inside: list[yaml.Node] = []
         if isinstance(node, yaml.SequenceNode):
             inside = node.value

@@ -143,7 +143,7 @@ def _check_any_time(model: BaseModel) -> None:
     if not isinstance(model, Model):
         return
     for field, value, meaning in (
-        ("readout", "last_row", "predicts the next row at whatever time"),
+        ("readout", "last_row", "predicts the same for any time"),
         ("update_rows", "every", "is changed by every row, and a requested time is one more row"),
         ("decay_rows", "every_row", "decays at every row, and a requested time is one more row"),
         ("time_input", "gap", "uses the gap since the row before, which a requested time splits"),

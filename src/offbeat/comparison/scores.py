@@ -84,9 +84,7 @@ def paired_tables(
         lacking = {m: [r for r in every if r not in runs] for m, runs in there.items()}
         kept = [r for r in every if all(r in runs for runs in there.values())]
         if len(there) < 2:
-            reasons.append(
-                f"{condition}: only {', '.join(there) or 'models that were not asked for'}"
-            )
+            reasons.append(f"{condition}: only {', '.join(there) or 'models that were not chosen'}")
             continue
         if baseline is not None and baseline not in there:
             reasons.append(f"{condition}: the baseline {baseline!r} has no run")

@@ -18,7 +18,7 @@ from offbeat.errors import FileFormatError, InputError
 SCHEMA_VERSION = 2
 """Increased when earlier versions would misread new files.
 
-Version 1, of Offbeat 0.1.0, has no roles, and columns of actions (`action|0`, ...) beside those of
+Version 1, of Offbeat 0.1.0, has no roles, and columns of actions (`action|0`, ...) besides those of
 the channels; when it is read, they become channels with the role `action`.
 """
 

@@ -163,8 +163,8 @@ def load_split(path: str | Path, dataset: Dataset) -> tuple[Dataset, Dataset, Da
     """Repeats a saved split.
 
     Args:
-        path: JSON file that `save_split` wrote; where it is missing, `parts.json` beside it, which
-            Offbeat 0.1.0 wrote.
+        path: JSON file that `save_split` wrote; where it is missing, `parts.json` in its folder,
+            which Offbeat 0.1.0 wrote.
         dataset: as recorded.
 
     Returns:

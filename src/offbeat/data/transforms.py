@@ -49,7 +49,7 @@ def lowest_of(low: float, high: float, period: float) -> float | None:
         period: a full turn.
 
     Returns:
-        `-period / 2` or 0 where all values lie within one turn from there; None where they lie in
+        `-period / 2` or 0 if all values are within one turn from there; None if they are in
         neither range.
     """
     for lowest in (-period / 2, 0.0):

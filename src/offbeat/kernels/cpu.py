@@ -106,7 +106,7 @@ def supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | 
     if spec.field and tableau(spec.solver).adaptive:
         return f"the solver {spec.solver} chooses its own steps"
     if spec.field and spec.adjoint:
-        return "gradients are asked for by the adjoint method"
+        return "gradients are computed by the adjoint method"
     if max(len(spec.field), len(spec.decoder)) > _MOST_LAYERS + 1:
         return f"a perceptron has more than {_MOST_LAYERS} layers"
     if device.type != "cpu" or dtype not in _TYPES:
@@ -126,7 +126,7 @@ def unsupported(
     if any(t.dtype != state.dtype or t.device != state.device for t in (*trained, *given)):
         return "trained parts, inputs and state differ in type or device"
     if any(t.requires_grad for t in given):
-        return "a gradient with respect to the step inputs is asked for"
+        return "a gradient with respect to the step inputs is needed"
     return None
 
 

@@ -1,4 +1,4 @@
-"""A figure of fills and forecasts beside observed and masked values."""
+"""A figure of fills and forecasts with observed and masked values."""
 
 from __future__ import annotations
 

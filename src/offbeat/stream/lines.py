@@ -22,7 +22,7 @@ class LineSession:
 
     An observation is answered with what was done with it and, where it is a new row, with the
     prediction that was made for it before its values were used: one step ahead. With a horizon, it
-    is answered with the prediction so many seconds after the newest row.
+    is answered with the prediction `horizon_s` after the newest row.
 
     Args:
         stream: takes the observations.

@@ -15,7 +15,7 @@ from offbeat.data.trajectory import SECONDS_PER
 from offbeat.errors import InputError, one_of
 
 Time = int | float
-"""In the unit of a stream; integers are exact, whatever the origin of their clock."""
+"""In the unit of a stream; integers are exact for any origin of their clock."""
 
 Values = Mapping[str, float | None] | ArrayLike
 """Channel to value, or one value per channel; NaN, None and what is left out was not measured."""

@@ -23,8 +23,8 @@ until it is clear whether the clock has jumped. `jumped`: the clock has.
 class StreamOptions:
     """Options for messages out of order, repeated, stale or on another clock.
 
-    With the defaults a stream of increasing times is the batch pass over the same rows, whatever
-    its gaps, and no single wrong time stamp can end it.
+    With the defaults a stream of increasing times is the batch pass over the same rows, for any
+    gaps, and a single wrong time stamp cannot end it.
 
     Attributes:
         merge_within_s: s; messages whose times differ by no more than this are one row, at the time
@@ -35,7 +35,7 @@ class StreamOptions:
         late: a message older than the newest row, by no more than `jump_back_s`: `drop` it;
             `reorder`, put it in its place and run the rows after it again; or `error`.
         reorder_rows: rows that are kept for `reorder`; what is older than these is dropped.
-        stale_after_s: s; what is older than this on arrival is dropped, whatever `late` says:
+        stale_after_s: s; what is older than this on arrival is dropped, for any `late`:
             behind the `now` that `observe` is given, or else behind the newest row. None: never.
         jump: when the clock has jumped, `reset`, reset the state at the new time; `continue`, keep
             the state and treat the jump as one median gap; `drop`, keep the old clock, so that
@@ -43,9 +43,9 @@ class StreamOptions:
         jump_back_s: s; a message older than the newest row by more than this may mean a clock that
             was set back (a simulation started again, a log played again).
         jump_ahead_s: s; a message newer than the newest row by more than this may mean a clock that
-            was set ahead, or a wrong time stamp. None: it is a gap, of whatever length.
-        confirm: a clock has jumped when so many messages in a row agree; until then they are
-            pending, and one message on the old clock makes them late ones. Nothing pending is
+            was set ahead, or a wrong time stamp. None: it is a gap of any length.
+        confirm: a clock has jumped when this number of messages in a row agrees; until then they
+            are pending, and one message on the old clock makes them late ones. Nothing pending is
             lost: after the jump they are consumed.
         long_gap: after more than `long_gap_s` without a value, `saturate`, let the model's own
             limit act, or `reset`, reset the state.

@@ -19,7 +19,7 @@ Row = Mapping[str, Any]
 Group = tuple[str, ...]
 
 SESSIONS = ("sessions", "sittings")
-"""Name of the list of sessions beside a record, here and in version 0.1.0."""
+"""Names of the list of sessions in the folder of a record, now and in version 0.1.0."""
 
 _SCORINGS = ("after_first_observation", "masked", "after_first_row", "published")
 

@@ -35,7 +35,7 @@ class SweepResult:
     Attributes:
         folder: holds `record.parquet`, `record.csv`, `curves.parquet`, `curves.csv`, `runs/`.
         record: all runs that are finished, those of earlier calls too.
-        asked: runs that were asked for.
+        asked: requested runs.
         seconds: wall time of this call.
     """
 
@@ -46,7 +46,7 @@ class SweepResult:
 
     @property
     def missing(self) -> tuple[Run, ...]:
-        """Runs that were asked for and are not finished."""
+        """Requested runs that are not finished."""
         return tuple(run for run in self.asked if run.run_id not in self.record.runs)
 
     def __str__(self) -> str:

@@ -61,7 +61,7 @@ class Session:
 
         Args:
             tasks: in the order in which to start them.
-            asked: runs that the user asked for, finished ones too.
+            asked: requested runs, including finished ones.
             deadline: on the monotonic clock, s; stop then, in the middle of runs.
 
         Raises:
@@ -101,7 +101,7 @@ class Session:
             self.shown.close()
         if self.diverged:
             raise DivergenceError(
-                f"{len(self.diverged)} of the runs diverged, all others that were asked for are "
+                f"{len(self.diverged)} of the runs diverged, all other requested ones are "
                 f"done; the first: {self.diverged[0]}"
             )
         return self.record

@@ -85,7 +85,7 @@ class Columns:
         if not rest:
             raise FileFormatError(
                 f"{path} has no channels, only the columns {listed(names)}; it needs one column "
-                "per channel beside the time"
+                "per channel besides the time"
             )
         key, value = _long_form(rest, channel_column, value_column)
         if key is not None and value is not None:

@@ -4,7 +4,7 @@ robomimic (robomimic.github.io, "Dataset structure"): `data/demo_0/obs/<name>` a
 `data/demo_0/actions`, the environment as JSON in the attribute `env_args` of `data`, named subsets
 under `mask`. Minari (minari.farama.org, "Dataset standards"): `episode_0/observations`, one row
 longer than `episode_0/actions`, nested where the space is a dictionary or a tuple; the environment
-as JSON in `metadata.json` beside the file, or in an attribute of it. Neither stores times.
+as JSON in `metadata.json` in the same folder, or in an attribute of it. Neither stores times.
 
 Only arrays of numbers are read; pickled data are refused.
 """

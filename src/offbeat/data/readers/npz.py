@@ -94,7 +94,7 @@ def read_npz(
         shapes = ", ".join(f"{name!r} {array.shape}" for name, array in arrays.items()) or "nothing"
         raise FileFormatError(
             f"{path} has no array with a row for each of the {clock.shape} times in {time!r}, "
-            f"beside them it holds {shapes}"
+            f"besides them it has {shapes}"
         )
     if left:
         notes = (*notes, f"arrays without a row per time are left out: {', '.join(left)}")
