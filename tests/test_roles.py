@@ -118,3 +118,22 @@ def test_roles_are_saved_with_the_model(tmp_path):
 def test_data_with_nothing_to_predict_is_refused():
     with pytest.raises(ob.InputError, match="every channel is exogenous"):
         ob.make_model("gru", arm(3, roles=("exogenous",) * 3))
+
+
+def test_an_exogenous_channel_is_nan_in_every_answer_and_never_filled():
+    data = arm(4)
+    model = small_model("anchored_ode_gru_d", data)
+    for answered in (ob.predict(model, data), ob.forecast(model, data, [0.1])):
+        values = np.concatenate([t.values for t in answered])
+        assert np.isnan(values[:, 2]).all()
+        assert np.isfinite(values[:, :2]).all()
+    for filled, given in zip(ob.impute(model, data), data, strict=True):
+        seen = given.observed[:, 2]
+        assert np.array_equal(filled.values[seen, 2], given.values[seen, 2])
+        assert np.isnan(filled.values[~seen, 2]).all()
+        assert np.isfinite(filled.values[:, :2]).all()
+    stream = ob.Stream(model)
+    stream.observe(0.0, {"position": 0.1, "wind": 0.3})
+    predicted = stream.predict(0.1)
+    assert np.isfinite(predicted[:2]).all()
+    assert np.isnan(predicted[2])

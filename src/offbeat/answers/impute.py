@@ -77,7 +77,12 @@ def impute(
         )
     filled = Dataset(
         tuple(
-            Trajectory(t.times, values, names=forward.names, units=forward.units)
+            Trajectory(
+                t.times,
+                np.where(forward.predicted, values, np.nan),  # exogenous channels are not filled
+                names=forward.names,
+                units=forward.units,
+            )
             for t, values in zip(applied, fills, strict=True)
         ),
         {**dataset.meta, "filled_by": forward.name, "filled": mode},

@@ -44,7 +44,8 @@ def predict(
 
     Returns:
         One trajectory of predictions per trajectory, in original units, at the requested times;
-        its channels are in the order of the model.
+        its channels are in the order of the model. Exogenous channels, which are not predicted, are
+        NaN.
 
     Raises:
         InputError: other channels than the model's, times that are not finite numbers in
@@ -74,7 +75,7 @@ def predict(
             results.append(
                 Trajectory(
                     union.times[rows],
-                    model.scaler.original(values[rows]),
+                    np.where(model.predicted, model.scaler.original(values[rows]), np.nan),
                     names=model.names,
                     units=model.units,
                     roles=model.roles,

@@ -11,11 +11,8 @@ import torch
 from torch import Tensor
 
 from offbeat.data.scaler import Scaler
-from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.trajectory import ACTION, EXOGENOUS, STATE, Dataset, Trajectory
 from offbeat.errors import InputError
-
-STATE, ACTION, EXOGENOUS = "state", "action", "exogenous"
-"""Roles of channels: observed and predicted; predicted, observed one row later; observed only."""
 
 
 @dataclass(frozen=True, eq=False)

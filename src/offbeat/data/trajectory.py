@@ -17,7 +17,7 @@ from offbeat.errors import InputError, one_of
 SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
 """Units of input times; internally, times are in seconds."""
 
-ROLES = ("state", "action", "exogenous")
+STATE, ACTION, EXOGENOUS = ROLES = ("state", "action", "exogenous")
 """Roles of channels: a `state` is observed and predicted; an `action` is given, or
 predicted and fed back; an `exogenous` channel is observed and never predicted."""
 

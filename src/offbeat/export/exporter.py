@@ -196,6 +196,7 @@ def _record(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
         "model": model.config.name,
         "names": list(model.names),
         "units": list(model.units),
+        "roles": list(model.roles),
         "median_gap_s": model.statistics.median_gap,
         "elapsed_limit_s": model.statistics.longest_elapsed * limit,
         "transforms": model.transforms.to_dict(),

@@ -168,5 +168,6 @@ def _read(record: Any) -> tuple[StreamInfo, Arrays]:
         median_gap=float(record["median_gap_s"]),
         elapsed_limit=float(record["elapsed_limit_s"]),
         transforms=Transforms.from_dict(record["transforms"] if record["version"] > 1 else _NONE),
+        roles=tuple(record.get("roles", ())),
     )
     return info, {name: initial[name] for name in STATE}

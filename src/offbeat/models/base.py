@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from offbeat.data.batch import Batch
 from offbeat.data.scaler import Scaler
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError
 from offbeat.models.statistics import Statistics
@@ -88,6 +90,11 @@ class BaseModel(nn.Module):
     def device(self) -> torch.device:
         """That of the trained parameters."""
         return self.mean.device
+
+    @property
+    def predicted(self) -> NDArray[np.bool_]:
+        """(channels,) True where the channel is predicted; exogenous ones are not."""
+        return np.array([role != EXOGENOUS for role in self.roles])
 
     @property
     def needs_generator(self) -> bool:

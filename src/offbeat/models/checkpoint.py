@@ -13,8 +13,8 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as dump_tensors
 from torch import Tensor
 
-from offbeat.data.batch import STATE
 from offbeat.data.scaler import Scaler
+from offbeat.data.trajectory import STATE
 from offbeat.data.transforms import Transforms
 from offbeat.errors import FileFormatError, InputError
 from offbeat.files import atomic_folder

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from offbeat.config import ModelConfig
-from offbeat.data.batch import ACTION, Batch
+from offbeat.data.batch import Batch
+from offbeat.data.trajectory import ACTION
 from offbeat.errors import InputError
 from offbeat.kernels import (
     ScanParts,

@@ -14,9 +14,9 @@ import torch
 from torch import nn
 
 from offbeat.config import ModelConfig, Recipe, TrainConfig, from_mapping
-from offbeat.data.batch import EXOGENOUS, Batch
+from offbeat.data.batch import Batch
 from offbeat.data.scaler import Scaler, ScalerKind, check_observed
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError, one_of
 from offbeat.models.base import BaseModel, DataInfo

@@ -102,8 +102,8 @@ class LineSession:
         return {"reset": True}
 
     def _named(self, prediction: NDArray[np.float64] | None) -> dict[str, Any] | None:
-        """Channel to number, or to one number per time."""
+        """Channel to number, or to one number per time; without exogenous channels."""
         if prediction is None:
             return None
-        columns = prediction.T.tolist()
-        return dict(zip(self.stream.names, columns, strict=True))
+        columns = zip(self.stream.names, prediction.T, strict=True)
+        return {name: column.tolist() for name, column in columns if not np.isnan(column).any()}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat.data.scaler import Scaler
+from offbeat.data.trajectory import EXOGENOUS
 from offbeat.data.transforms import Transforms
 from offbeat.errors import DivergenceError, InputError
 from offbeat.stream.engine import Engine
@@ -33,6 +34,7 @@ class StreamInfo:
         median_gap: s, between the rows of the training set.
         elapsed_limit: s without an observation, at which the model's time saturates.
         transforms: input transforms of the model.
+        roles: of the channels; predictions of exogenous ones are NaN. Empty: all are states.
     """
 
     names: tuple[str, ...]
@@ -41,6 +43,7 @@ class StreamInfo:
     median_gap: float
     elapsed_limit: float
     transforms: Transforms = Transforms()  # noqa: RUF009  # frozen
+    roles: tuple[str, ...] = ()
 
 
 class LiveStream:
@@ -61,6 +64,7 @@ class LiveStream:
         self.names, self.units, self.options = info.names, info.units, options
         transformed = not info.transforms.is_identity
         self._reader = RowReader(info.names, info.scaler, engine.dtype, scale=not transformed)
+        self._exogenous = [i for i, role in enumerate(info.roles) if role == EXOGENOUS]
         self._scaler = Scaler.identity(len(info.names)) if transformed else info.scaler
         if transformed:
             engine = TransformedEngine(engine, info.transforms, info.names, info.scaler)
@@ -226,7 +230,9 @@ class LiveStream:
         if not np.isfinite(predicted).all():
             raise DivergenceError("the state is no longer finite; reset the stream")
         self._placing.counters.predictions += len(times)
-        return self._scaler.original(predicted)
+        predicted = self._scaler.original(predicted)
+        predicted[:, self._exogenous] = np.nan
+        return predicted
 
     def _asked(self, t: Time) -> float:
         """A time to predict at, in s."""

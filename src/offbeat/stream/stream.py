@@ -61,6 +61,7 @@ class Stream(LiveStream):
             median_gap=model.statistics.median_gap,
             elapsed_limit=model.statistics.longest_elapsed * limit,
             transforms=model.transforms,
+            roles=model.roles,
         )
         window = chosen.window_rows or model.statistics.rows or 1
         engine = engine_of(model, seed=check_seed(seed), window=window)

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from offbeat.data.batch import ACTION, Batch
+from offbeat.data.batch import Batch
+from offbeat.data.trajectory import ACTION
 from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model
 from offbeat.stream.engine import Arrays, Engine
