@@ -6,11 +6,8 @@ import hashlib
 import re
 from functools import cache
 
-from offbeat.data.scaler import Scaler
-from offbeat.evaluation import evaluate
-from offbeat.models.zoo import make_model
+from offbeat import Scaler, evaluate, fit, make_model
 from offbeat.sweeps.fingerprint import digest, random_walks
-from offbeat.training import fit
 from thesis.protocol import CONTROLS, MODELS, Protocol, Run
 from thesis.record import SCORINGS
 

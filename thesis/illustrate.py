@@ -12,13 +12,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from offbeat.data.masking import mask_out
-from offbeat.data.simulate import simulate
-from offbeat.data.trajectory import Dataset
-from offbeat.data.windows import windows
-from offbeat.errors import InputError, MissingExtraError, require
-from offbeat.models.checkpoint import CONFIG, load_model
-from offbeat.models.model import Model
+from offbeat import (
+    Dataset,
+    InputError,
+    MissingExtraError,
+    Model,
+    load_model,
+    mask_out,
+    simulate,
+    windows,
+)
+from offbeat.errors import require
+from offbeat.models.checkpoint import CONFIG
 from thesis.illustrations import Illustrations, StateMap, Trace
 
 LABELS = (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.errors import FileFormatError, InputError
+from offbeat import FileFormatError, InputError
 from offbeat.files import atomic_path
 
 FILE = "illustrations.npz"

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
-from offbeat.config import ModelConfig, TrainConfig
-from offbeat.errors import InputError, one_of
+from offbeat import InputError, ModelConfig, TrainConfig
+from offbeat.errors import one_of
 
 if TYPE_CHECKING:
-    from offbeat.data.trajectory import Dataset
+    from offbeat import Dataset
 
 SELF_FEEDING = ("gru", "gru_d")
 """Models that are fed their own predictions in the thesis' rows."""
@@ -203,7 +203,7 @@ class Protocol:
 
     def simulate(self, *, progress: bool = True) -> Dataset:
         """The recorded trajectories that all runs cut their windows from."""
-        from offbeat.data.simulate import simulate
+        from offbeat import simulate
 
         return simulate(
             self.robot,
@@ -220,9 +220,7 @@ class Protocol:
             recorded: from `simulate`.
             run: names fraction and seed.
         """
-        from offbeat.data.masking import mask_out
-        from offbeat.data.splits import split
-        from offbeat.data.windows import windows
+        from offbeat import mask_out, split, windows
 
         cut = windows(recorded, self.window, seed=run.seed_draw)
         masked = mask_out(cut, run.observed_fraction, seed=run.seed_draw)

@@ -54,7 +54,7 @@ def report_command(
 def _illustrated(
     runs: Path, out: Path, fraction: float, shown: Illustrations | None
 ) -> Illustrations | None:
-    from offbeat.errors import MissingExtraError
+    from offbeat import MissingExtraError
     from thesis.illustrate import checkpoints_of, illustrate, runs_of
 
     found = checkpoints_of(runs, fraction)

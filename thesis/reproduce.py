@@ -7,9 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
-from offbeat.config import ModelConfig, TrainConfig
-from offbeat.data.scaler import Scaler
-from offbeat.data.trajectory import Dataset
+from offbeat import Dataset, ModelConfig, Scaler, TrainConfig
 from offbeat.metrics import row_0_constant
 from offbeat.models.base import BaseModel
 from offbeat.sweeps import plan

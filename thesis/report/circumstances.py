@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.errors import OffbeatError
+from offbeat import OffbeatError
 from offbeat.sweeps.record import SESSIONS
 from thesis.protocol import Protocol
 from thesis.report import thesis_numbers as thesis

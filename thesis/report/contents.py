@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
+from offbeat import MissingExtraError
 from offbeat.comparison.statistics import FriedmanResult
-from offbeat.errors import MissingExtraError
 from offbeat.plots.ranks import ranks_figure
 from thesis.illustrations import Illustrations
 from thesis.report import (

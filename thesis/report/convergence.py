@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat import InputError
 from offbeat.comparison.statistics import convergence, enough_epochs, paired_comparison, settling
-from offbeat.errors import InputError
 from thesis.report import findings as say
 from thesis.report import thesis_numbers as thesis
 from thesis.report.findings import Verdict

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.errors import InputError
+from offbeat import InputError
 from offbeat.plots.style import COLUMN_WIDTH, RC, STYLES, plain_ticks, style_of
 from thesis.report import thesis_numbers as thesis
 from thesis.report.records import Record

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from offbeat.errors import InputError, one_of
+from offbeat import InputError
+from offbeat.errors import one_of
 from offbeat.plots.animation import stills
 from offbeat.plots.style import PAGE_WIDTH, RC
 from thesis.illustrations import Illustrations

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from offbeat.errors import InputError
+from offbeat import InputError
 from offbeat.plots.style import INK, PAGE_WIDTH, RC, style_of
 from thesis.illustrations import StateMap, Trace
 from thesis.report.figure_robot import CHANNELS

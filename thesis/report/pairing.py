@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat import InputError
 from offbeat.comparison.statistics import (
     FriedmanResult,
     PairedComparison,
@@ -18,7 +19,6 @@ from offbeat.comparison.statistics import (
     thesis_test,
 )
 from offbeat.comparison.statistics.samples import FEWEST
-from offbeat.errors import InputError
 from offbeat.tables import MINUS
 from thesis.protocol import CONTROLS
 from thesis.report import thesis_numbers as thesis

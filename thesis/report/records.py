@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.errors import FileFormatError, InputError
+from offbeat import FileFormatError, InputError
 from thesis.record import CURVE_COLUMNS, GROUP, RUN_COLUMNS
 from thesis.record import Record as RowRecord
 

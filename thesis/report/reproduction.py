@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offbeat.errors import InputError
+from offbeat import InputError
 from offbeat.files import writable, write_text
 from offbeat.plots import figures
 from thesis.illustrations import Illustrations

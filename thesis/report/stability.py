@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from offbeat import InputError
 from offbeat.comparison.statistics import SpreadComparison, holm, spread_comparison
-from offbeat.errors import InputError
 from thesis.report import findings as say
 from thesis.report import thesis_numbers as thesis
 from thesis.report.findings import Verdict

@@ -8,7 +8,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from offbeat.errors import InputError
+from offbeat import InputError
 from offbeat.tables import DASH, escape_latex, latex, markdown
 
 MIXED = "†"

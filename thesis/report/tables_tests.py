@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from offbeat import InputError
 from offbeat.comparison.statistics import FriedmanResult, shapiro_wilk
-from offbeat.errors import InputError
 from offbeat.tables import MINUS
 from thesis.protocol import CONTROLS
 from thesis.report import thesis_numbers as thesis
