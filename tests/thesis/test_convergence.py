@@ -116,10 +116,10 @@ def test_epochs_are_enough_where_every_curve_has_settled_by_then():
         (lambda: settling([1.0, math.nan]), "holds nan after epoch 2, expected positive errors"),
         (lambda: settling([1.0, 0.0]), "holds 0.0 after epoch 2"),
         (lambda: settling([1.0], final_over=2), "from 1 to the 1 epochs of the curve, got 2"),
-        (lambda: settling([1.0], tolerance=5), "tolerance must lie between 0 and 1, got 5"),
+        (lambda: settling([1.0], tolerance=5), "tolerance must be between 0 and 1, got 5"),
         (lambda: convergence([]), "got no curves"),
         (lambda: enough_epochs([], 5), "got no curves"),
-        (lambda: enough_epochs([[3.0, 2.0, 1.0]], 3), "must lie below the 3 of the shortest curve"),
+        (lambda: enough_epochs([[3.0, 2.0, 1.0]], 3), "must be below the 3 of the shortest curve"),
     ],
 )
 def test_curves_that_cannot_be_measured_are_refused(call, said):
