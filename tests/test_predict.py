@@ -87,3 +87,30 @@ def test_nothing_of_a_prediction_needs_a_gradient():
     ob.predict(model, data)
     assert torch.is_grad_enabled()
     assert all(p.grad is None for p in model.parameters())
+
+
+def test_one_trajectory_is_a_data_set_and_anything_else_is_refused_in_one_line():
+    data = dataset(3)
+    model = small_model("anchored_ode_gru_d", data)
+    one = data[0]
+    alone, among = ob.predict(model, one)[0], ob.predict(model, data)[0]
+    np.testing.assert_allclose(alone.values, among.values, rtol=1e-12)
+    assert len(ob.forecast(model, [one, data[1]], 0.1)) == 2
+    assert len(ob.impute(model, one)) == 1
+    for call in (
+        lambda: ob.predict(model, "log.csv"),
+        lambda: ob.forecast(model, 3, 0.1),
+        lambda: ob.impute(model, None),
+        lambda: ob.evaluate(model, "log.csv"),
+        lambda: ob.fit(model, "log.csv"),
+        lambda: ob.inspect("log.csv"),
+        lambda: ob.mask_out("log.csv", 0.5),
+        lambda: ob.split("log.csv"),
+        lambda: ob.make_model("gru", "log.csv"),
+    ):
+        with pytest.raises(ob.InputError, match="expected a Dataset, a Trajectory or a list"):
+            call()
+    with pytest.raises(ob.InputError, match="observed_fraction must be"):
+        ob.mask_out(data, "half")
+    with pytest.raises(ob.InputError, match="seed must be"):
+        ob.make_model("gru", data, seed="one")

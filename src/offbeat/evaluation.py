@@ -93,6 +93,7 @@ def evaluate(
     Raises:
         InputError: the data has other channels than a model, or models score in other units.
     """
+    dataset = Dataset.of(dataset)
     if isinstance(models, BaseModel):
         models = {models.name: models}
     if not models or LAST_VALUE in models:

@@ -97,6 +97,8 @@ def fit(
             `keep="best"` needs one, or `out` holds another run.
         DivergenceError: the loss is no longer finite; the last good checkpoint is kept.
     """
+    train = Dataset.of(train)
+    validation = None if validation is None else Dataset.of(validation)
     asked = config or TrainConfig()
     if validation is None and (asked.patience is not None or asked.keep == "best"):
         raise InputError("patience and keep='best' need a validation set; got none")

@@ -29,6 +29,7 @@ def forecast(model: BaseModel, dataset: Dataset, horizons: ArrayLike) -> Dataset
         InputError: horizons that are not above 0 or do not increase, other channels than the
             model's, or a model that cannot predict at any time.
     """
+    dataset = Dataset.of(dataset)
     after = checked_horizons(horizons)
     times = [t.times[-1] + after for t in dataset]
     predicted = predict(model, dataset, times=times)

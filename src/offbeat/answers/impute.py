@@ -60,6 +60,7 @@ def impute(
     Raises:
         InputError: other channels than the model's, or two-sided filling with a single model.
     """
+    dataset = Dataset.of(dataset)
     forward = model.forward if isinstance(model, TwoSided) else model
     mode = mode or ("two_sided" if isinstance(model, TwoSided) else "causal")
     one_of("mode", mode, MODES)

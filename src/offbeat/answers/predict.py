@@ -52,6 +52,7 @@ def predict(
             increasing order, or a model that cannot predict at any time (see
             `thesis_config`).
     """
+    dataset = Dataset.of(dataset)
     check_seed(seed)
     if isinstance(size, bool) or not isinstance(size, int) or size < 1:
         raise InputError(f"size must be a number of trajectories of at least 1, got {size!r}")

@@ -125,6 +125,7 @@ def inspect(dataset: Dataset) -> Inspection:
     Args:
         dataset: from `read`.
     """
+    dataset = Dataset.of(dataset)
     steps = np.concatenate([np.diff(t.times) for t in dataset])
     rows = sum(t.rows for t in dataset)
     channels = tuple(_channel(dataset, c, rows) for c in range(dataset.channels))

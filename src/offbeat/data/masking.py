@@ -58,7 +58,9 @@ def mask_out(
         InputError: the fraction is not above 0 and at most 1, it would leave no row, an option is
             given that this kind of mask does not have, or runs are too short to be separated.
     """
-    if not 0 < observed_fraction <= 1:
+    dataset = Dataset.of(dataset)
+    number = isinstance(observed_fraction, int | float)
+    if not (number and 0 < observed_fraction <= 1):
         raise InputError(
             f"observed_fraction must be above 0 and at most 1, got {observed_fraction!r}; "
             "0.3 keeps 30 % of the rows"

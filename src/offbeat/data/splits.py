@@ -38,6 +38,7 @@ def split(
     Raises:
         InputError: fractions are not positive or do not sum to 1, or a part would be empty.
     """
+    dataset = Dataset.of(dataset)
     return tuple(dataset.take(index) for index in _drawn(len(dataset), fractions, seed))
 
 
@@ -98,6 +99,7 @@ def apply_split(dataset: Dataset, config: SplitConfig) -> tuple[Dataset, Dataset
     Raises:
         InputError: as of `windows`, `mask_out`, `split` and `split_in_time`.
     """
+    dataset = Dataset.of(dataset)
     if config.by == "time":
         in_time = split_in_time(dataset, config.fractions)
         dataset = replace(dataset, trajectories=tuple(t for part in in_time for t in part))

@@ -256,6 +256,27 @@ class Dataset(Sequence[Trajectory]):
         object.__setattr__(self, "trajectories", trajectories)
         object.__setattr__(self, "meta", dict(self.meta))
 
+    @classmethod
+    def of(cls, data: Dataset | Trajectory | Sequence[Trajectory]) -> Dataset:
+        """A data set as it is, or one of a trajectory or several.
+
+        Args:
+            data: what a function that works on data sets was given.
+
+        Raises:
+            InputError: it is something else.
+        """
+        if isinstance(data, Dataset):
+            return data
+        if isinstance(data, Trajectory):
+            return cls((data,))
+        if isinstance(data, list | tuple) and all(isinstance(one, Trajectory) for one in data):
+            return cls(tuple(data))
+        raise InputError(
+            f"expected a Dataset, a Trajectory or a list of them, got {type(data).__name__}; "
+            "offbeat.read gives a data set of a file"
+        )
+
     @property
     def names(self) -> tuple[str, ...]:
         """Channel names."""

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from offbeat.config import ModelConfig, Recipe, TrainConfig, from_mapping
+from offbeat.config import ModelConfig, Recipe, TrainConfig, check_seed, from_mapping
 from offbeat.data.batch import Batch
 from offbeat.data.scaler import Scaler, ScalerKind, check_observed
 from offbeat.data.trajectory import EXOGENOUS, Dataset
@@ -270,6 +270,8 @@ def make_model(
     Example:
         >>> model = make_model("ode_rnn", train, hidden_size=32)  # doctest: +SKIP
     """
+    train = Dataset.of(train)
+    check_seed(seed)
     name = model if isinstance(model, str) else model.name
     entry = MODELS[name]
     if entry.factory is not None:
