@@ -15,7 +15,7 @@ from torch import Tensor, nn
 import offbeat as ob
 from offbeat import kernels
 from offbeat.kernels import BACKENDS, Backend, reference
-from offbeat.models.zoo import MODELS
+from offbeat.models.zoo import MODELS, ModelEntry
 from offbeat.parts import CELLS, FIELDS, HEADS, Cell, Head, Perceptron, Prediction
 
 EPOCHS = ob.TrainConfig(epochs=2, batch_size=4)
@@ -235,6 +235,16 @@ def test_a_forward_that_gives_no_prediction_is_refused_in_one_line(entries):
     ob.register_model("wrong", Wrong)
     with pytest.raises(ob.InputError, match=r"'wrong' gave .* expected a Prediction whose mean"):
         ob.evaluate(ob.make_model("wrong", dataset(3)), dataset(3))
+
+
+def test_a_recipe_is_completed_and_asks_for_the_validation_set_that_it_needs(entries):
+    MODELS.register("bare", ModelEntry(factory=LastAndSlope))  # as an entry point can give it
+    data = dataset(4)
+    recipe = ob.fit(ob.make_model("bare", data), data, config=EPOCHS, progress=False).recipe
+    assert (recipe.optimizer, recipe.epochs, recipe.keep) == ("adam", 2, "last")
+    ob.register_model("patient", LastAndSlope, recipe={"patience": 2})
+    with pytest.raises(ob.InputError, match=r"patience .* needs a validation set"):
+        ob.fit(ob.make_model("patient", data), data, config=EPOCHS, progress=False)
 
 
 def test_a_choice_of_parts_is_a_model_too(entries):

@@ -112,6 +112,8 @@ def fit(
     counts = validated is not None and validated.counted > 0
     recipe = recipe_of(model.name, asked, validated=counts)
     if not counts and (recipe.patience is not None or recipe.keep == "best"):
+        if validation is None:
+            raise InputError("patience or keep='best' of the recipe needs a validation set")
         raise InputError(
             "no value of the validation set counts: none is known after its channel's first "
             "observation; give a longer validation set, or keep='last' and no patience"

@@ -156,7 +156,7 @@ def register_model(
         replace: allow a name that is taken.
 
     Raises:
-        InputError: the name is taken, a field is unknown, or the model is nothing of these.
+        InputError: the name is taken, a field is unknown, or the model is none of these.
     """
     composed = isinstance(model, Mapping)
     common = _THESIS_RECIPE if composed else _FOREIGN_RECIPE
@@ -236,11 +236,12 @@ def recipe_of(name: str, config: TrainConfig | None = None, *, validated: bool) 
         config: given options; None for the recipe.
         validated: whether there is a validation set; then the best weights on it are kept.
     """
-    own = MODELS[name].recipe if name in MODELS else _FOREIGN_RECIPE
+    entry = MODELS[name] if name in MODELS else ModelEntry(factory=nn.Module)
+    common = _THESIS_RECIPE if entry.factory is None else _FOREIGN_RECIPE
     asked = {} if config is None else {k: v for k, v in asdict(config).items() if v is not None}
     if asked.get("clip_norm") == math.inf:
         asked["clip_norm"] = None
-    return Recipe(**{"keep": "best" if validated else "last", **own, **asked})
+    return Recipe(**{"keep": "best" if validated else "last", **common, **entry.recipe, **asked})
 
 
 def make_model(

@@ -54,9 +54,6 @@ class Head(nn.Module):
 
     Args:
         shape: sizes and statistics.
-
-    Attributes:
-        size: decoder outputs per row.
     """
 
     mean: Tensor
