@@ -1,0 +1,142 @@
+"""The last observations of every channel, and times since observation in bins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from offbeat.baselines.base import Array, State, namespace
+from offbeat.data.trajectory import Dataset
+
+LONGEST_BIN = 24
+"""Most bins of times since observation."""
+
+
+class History:
+    """The last observations of every channel, newest first.
+
+    The state has `times` and `values` of shape (batch, channels, depth), 0 where there was none
+    yet, and `count` (batch, channels) of the observations so far, at most the depth.
+
+    Args:
+        depth: observations that are kept.
+    """
+
+    def __init__(self, depth: int) -> None:
+        self.depth = depth
+
+    def start(self, like: Any) -> State:
+        """No observation yet."""
+        empty = namespace(like).stack([like] * self.depth, -1)
+        return {"times": empty, "values": empty, "count": like}
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        """The state after a row; see `CausalBaseline.observe`."""
+        xp = namespace(values)
+        at = mask[..., None]
+        time = (time + 0.0 * values)[..., None]
+        times = xp.concatenate([time, state["times"][..., :-1]], -1)
+        kept = xp.concatenate([values[..., None], state["values"][..., :-1]], -1)
+        return {
+            "times": xp.where(at, times, state["times"]),
+            "values": xp.where(at, kept, state["values"]),
+            "count": xp.clip(state["count"] + mask, 0, self.depth),
+        }
+
+    @staticmethod
+    def age(state: State, time: Any) -> Any:
+        """(batch, channels) s since the last observation; infinite before the first one."""
+        xp = namespace(state["count"])
+        since = time - state["times"][..., 0]
+        return xp.where(state["count"] > 0, since, np.inf)
+
+    @staticmethod
+    def last(state: State, before: Any) -> Any:
+        """(batch, channels) the last value, or `before` where there was none."""
+        xp = namespace(state["count"])
+        return xp.where(state["count"] > 0, state["values"][..., 0], before)
+
+    @staticmethod
+    def slope(state: State, back: int = 1) -> Any:
+        """(batch, channels) slope over the last `back` + 1 observations, or over those there are.
+
+        Args:
+            state: of a history deeper than `back`.
+            back: number of intervals.
+
+        Returns:
+            Per s; 0 where there are fewer than two observations.
+        """
+        xp = namespace(state["count"])
+        rise = span = 0.0 * state["count"]
+        for k in range(1, back + 1):
+            there = state["count"] > k
+            rise = xp.where(there, state["values"][..., 0] - state["values"][..., k], rise)
+            span = xp.where(there, state["times"][..., 0] - state["times"][..., k], span)
+        return rise / xp.where(span > 0, span, 1.0)
+
+
+@dataclass(frozen=True)
+class AgeBins:
+    """Bins of the time since observation: up to 1.5 typical gaps, then doubling.
+
+    Attributes:
+        edges: (bins,) s, upper end of each bin; increasing. Ages beyond the last one are in the
+            last bin.
+    """
+
+    edges: Array
+
+    @classmethod
+    def of(cls, tasks: Dataset) -> AgeBins:
+        """The bins of the ages that occur in tasks.
+
+        Args:
+            tasks: as of `Baseline.fit`.
+        """
+        gap, longest = typical_gap(tasks), longest_age(tasks)
+        count = int(
+            np.clip(np.ceil(np.log2(max(longest / (1.5 * gap), 1.0)) - 0.3), 0, LONGEST_BIN)
+        )
+        edges = 1.5 * gap * 2.0 ** np.arange(count + 1)
+        edges[-1] = max(edges[-1], longest)
+        return cls(np.asarray(edges))
+
+    def __len__(self) -> int:
+        return len(self.edges)
+
+    @property
+    def middle(self) -> Array:
+        """(bins,) s, a typical age of each bin."""
+        return np.concatenate([self.edges[:1] / 1.5, np.sqrt(self.edges[1:] * self.edges[:-1])])
+
+    def of_age(self, age: Any) -> Any:
+        """The bin of each age, int64, of the same shape."""
+        xp = namespace(age)
+        found = xp.zeros_like(age)
+        for edge in self.edges[:-1]:
+            found = found + (age > float(edge))
+        return found.astype(np.int64) if xp is np else found.long()
+
+
+def typical_gap(dataset: Dataset) -> float:
+    """Median time between consecutive observations of a channel, over all channels, in s."""
+    gaps = [np.diff(t.times[t.observed[:, c]]) for t in dataset for c in range(t.channels)]
+    every = np.concatenate(gaps)
+    if not len(every):
+        every = np.concatenate([np.diff(t.times) for t in dataset])
+    return float(np.median(every)) if len(every) else 1.0
+
+
+def longest_age(dataset: Dataset) -> float:
+    """Longest time from an observation of a channel to a later row where it is known, in s."""
+    longest = 0.0
+    for t in dataset:
+        times = np.where(t.observed, t.times[:, None], -np.inf)
+        before = np.vstack([np.full((1, t.channels), -np.inf), times[:-1]])
+        age = t.times[:, None] - np.maximum.accumulate(before, axis=0)
+        age = age[t.known & np.isfinite(age)]
+        longest = max(longest, float(age.max()) if len(age) else 0.0)
+    return longest
