@@ -98,6 +98,26 @@ def test_impute_keeps_what_was_measured_and_fills_the_rest(run, log, tmp_path, m
     assert np.array_equal(got, expected.values)
 
 
+def test_impute_at_a_rate_fills_an_outage_of_all_sensors_in_one_trajectory(run, log, tmp_path):
+    head, *lines = log.read_text().splitlines()
+    late = [f"{int(line.split(',')[0]) + 3000},{line.partition(',')[2]}" for line in lines[200:]]
+    broken = tmp_path / "broken.csv"
+    broken.write_text("\n".join([head, *lines[:200], *late]) + "\n")
+    plain, filled = tmp_path / "plain.csv", tmp_path / "filled.csv"
+    assert main(["impute", str(run), str(broken), str(plain)]) == 0
+    assert main(["impute", str(run), str(broken), str(filled), "--rate_hz=20"]) == 0
+    assert {row["trajectory"] for row in table(plain)} == {"0", "1"}
+    rows = table(filled)
+    assert {row["trajectory"] for row in rows} == {"0"}
+    assert len(rows) == 400 + 59  # every 50 ms from 3050 to 5950 ms
+    clock = np.array([int(row["clock_ms"]) for row in rows])
+    assert np.diff(clock).max() <= 75
+    inside = [row for row in rows if 3000 <= int(row["clock_ms"]) < 6000]
+    assert len(inside) == 59
+    assert all(row[f"{name}|observed"] == "false" for row in inside for name in NAMES)
+    assert all(np.isfinite(float(row[name])) for row in inside for name in NAMES)
+
+
 def test_impute_writes_the_same_table_as_parquet(run, log, tmp_path):
     import pyarrow.parquet as pq
 

@@ -26,6 +26,7 @@ from offbeat.answers.scoring import ChannelScores, _targets
 from offbeat.answers.two_sided import _sides_of, fit_rule, reversed_in_time
 from offbeat.baselines import fill, fillers, forecast, forecasters
 from offbeat.data.masking import masked_values
+from offbeat.data.rows import add_rows, times_at_rate
 
 NAN = float("nan")
 
@@ -554,3 +555,74 @@ def test_one_step_ahead_scores_stand_in_units_beside_the_last_value():
     table = units.table().splitlines()
     assert table[0].split() == ["channel", "unit", "values", "gru", "last_value"]
     assert table[1].split()[:2] == ["channel_0", "m"]
+
+
+# --- rows that the log lacks ----------------------------------------------------------------------
+
+
+@given(st.integers(0, 1000), st.sampled_from([0.5, 3.0, 10.0, 47.0]))
+def test_times_at_a_rate_close_every_gap_and_stay_away_from_measured_rows(seed, rate):
+    random = np.random.default_rng(seed)
+    times = 100 + np.cumsum(random.choice([0.004, 0.1, 0.5, 4.0], 30))
+    one = ob.Trajectory(times, np.zeros((30, 1)))
+    added = times_at_rate(one, rate)
+    steps = (added - times[0]) * rate
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    if len(added):
+        assert np.abs(added[:, None] - times).min() >= 0.5 / rate * (1 - 1e-6)
+    every = np.union1d(times, added)
+    assert np.diff(every).max() <= 1.5 / rate * (1 + 1e-6)
+    assert times_at_rate(add_rows(one, added), rate).size == 0, "nothing is left to add"
+
+
+def test_a_log_at_the_rate_itself_gets_no_rows():
+    one = ob.Trajectory(np.arange(1000) * 0.01, np.zeros((1000, 1)))
+    assert len(times_at_rate(one, 100)) == 0
+    assert len(times_at_rate(one, 200)) == 999
+
+
+@pytest.mark.parametrize("mode", ["causal", "two_sided"])
+def test_an_outage_of_all_sensors_is_filled_at_a_rate_and_at_times(mode):
+    data = dataset(3, rows=40)
+    pair = pair_of(data, max_step=0.01)
+    times = data[0].times
+    cut = ob.Dataset(tuple(replace(t, times=t.times + 2.0 * (t.times > t.times[20])) for t in data))
+    plain = ob.impute(pair, cut, mode=mode)
+    filled = ob.impute(pair, cut, mode=mode, rate_hz=25)
+    for one, was, given_rows in zip(filled, plain, cut, strict=True):
+        own = np.isin(one.times, given_rows.times)
+        assert own.sum() == given_rows.rows
+        inside = (one.times > given_rows.times[20]) & (one.times < given_rows.times[21])
+        assert inside.sum() >= 49
+        assert not one.observed[~own].any()
+        assert np.isfinite(one.values).all()
+        seen = was.observed
+        assert np.array_equal(one.values[own][seen], was.values[seen])
+    asked = times[20] + np.array([0.5, 1.0, 1.5])
+    at = ob.impute(pair, cut[:1], mode=mode, times=asked)[0]
+    assert np.isin(asked, at.times).all()
+    assert at.rows == cut[0].rows + 3
+
+
+def test_a_causal_fill_at_added_rows_is_the_prediction_there():
+    data = dataset(2, rows=30)
+    model = small_model("anchored_ode_gru_d", data)
+    asked = data[0].times[4] + np.array([0.001, 0.002])
+    filled = ob.impute(model, data[:1], times=asked)[0]
+    got = filled.values[np.searchsorted(filled.times, asked)]
+    np.testing.assert_array_equal(got, ob.predict(model, data[:1], times=asked)[0].values)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"rate_hz": 0}, "rate_hz must be a positive"),
+        ({"rate_hz": 1e12}, "use a lower rate"),
+        ({"rate_hz": 10, "times": [0.1]}, "not both"),
+        ({"times": [0.2, 0.1]}, "increase strictly"),
+    ],
+)
+def test_rows_that_cannot_be_added_are_refused_in_one_line(options, said):
+    data = dataset(2, rows=20)
+    with pytest.raises(ob.InputError, match=said):
+        ob.impute(small_model("anchored_ode_gru_d", data), data, **options)

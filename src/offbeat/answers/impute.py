@@ -10,7 +10,13 @@ from typing import Literal
 import numpy as np
 
 from offbeat.answers.fill_rule import FillRule
-from offbeat.answers.predict import in_model_order, predict
+from offbeat.answers.predict import (
+    Times,
+    check_any_time,
+    in_model_order,
+    predict,
+    times_of_each,
+)
 from offbeat.answers.two_sided import (
     TwoSided,
     fill_two_sided,
@@ -18,6 +24,7 @@ from offbeat.answers.two_sided import (
     reversed_in_time,
 )
 from offbeat.config import TrainConfig
+from offbeat.data.rows import add_rows, times_at_rate
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.files import write_json
@@ -39,9 +46,13 @@ def impute(
     dataset: Dataset,
     *,
     mode: Literal["causal", "two_sided"] | None = None,
+    times: Times | None = None,
+    rate_hz: float | None = None,
     seed: int = 0,
 ) -> Dataset:
     """Fills every value that is not observed: masked ones, and those that were never measured.
+
+    A log has no rows where all of its sensors were out. `rate_hz`, or `times`, adds rows there.
 
     `causal` fills with the model's prediction from what was observed strictly before the row.
     `two_sided` combines it with the prediction of a backward model from the other side, by the rule
@@ -51,6 +62,10 @@ def impute(
         model: a trained model, or a pair from `fit_two_sided`.
         dataset: the observed data.
         mode: `causal` or `two_sided`; by default two-sided where the model is a pair.
+        times: s, at which a row is added where there is none: one array for all trajectories, or
+            one per trajectory, as of `predict`.
+        rate_hz: adds rows at this rate, from the first to the last row of each trajectory, where
+            no row is within half a period.
         seed: of the generator of self-feeding.
 
     Returns:
@@ -58,12 +73,25 @@ def impute(
         NaN; `observed` is True where it was measured, and False where it was filled.
 
     Raises:
-        InputError: other channels than the model's, or two-sided filling with a single model.
+        InputError: other channels than the model's, two-sided filling with a single model, `times`
+            and `rate_hz` together or invalid, or rows to add for a model that cannot predict at
+            any time.
     """
     dataset = Dataset.of(dataset)
     forward = model.forward if isinstance(model, TwoSided) else model
     mode = mode or ("two_sided" if isinstance(model, TwoSided) else "causal")
     one_of("mode", mode, MODES)
+    if times is not None and rate_hz is not None:
+        raise InputError("give times or rate_hz, not both")
+    if times is not None or rate_hz is not None:
+        check_any_time(forward)
+        added = (
+            times_of_each(times, len(dataset))
+            if times is not None
+            else [times_at_rate(t, rate_hz) for t in dataset]  # type: ignore[arg-type]
+        )
+        rows = (add_rows(t, at) for t, at in zip(dataset, added, strict=True))
+        dataset = replace(dataset, trajectories=tuple(rows))
     transforms = forward.transforms
     dataset = in_model_order(forward, dataset)
     applied = transforms.apply(dataset)

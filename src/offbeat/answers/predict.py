@@ -57,8 +57,8 @@ def predict(
     if isinstance(size, bool) or not isinstance(size, int) or size < 1:
         raise InputError(f"size must be a number of trajectories of at least 1, got {size!r}")
     if times is not None:
-        _check_any_time(model)
-    asked = [t.times for t in dataset] if times is None else _times_of_each(times, len(dataset))
+        check_any_time(model)
+    asked = [t.times for t in dataset] if times is None else times_of_each(times, len(dataset))
     transforms = model.transforms
     applied = transforms.apply(dataset)
     results: list[Trajectory] = []
@@ -120,8 +120,16 @@ def increasing_seconds(value: ArrayLike, what: str) -> NDArray[np.float64]:
     )
 
 
-def _times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
-    """(times,) s of each trajectory."""
+def times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
+    """(times,) s of each trajectory.
+
+    Args:
+        times: one time or one array for all trajectories, or one array per trajectory.
+        count: number of trajectories.
+
+    Raises:
+        InputError: they are not finite numbers in increasing order, or of another count.
+    """
     if hasattr(times, "__array__"):
         times = np.atleast_1d(np.asarray(times))
     nested = isinstance(times, list | tuple | np.ndarray) and any(np.ndim(t) for t in times)
@@ -136,8 +144,11 @@ def _times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
     return [increasing_seconds(at, f"times of trajectory {i}") for i, at in enumerate(each)]
 
 
-def _check_any_time(model: BaseModel) -> None:
+def check_any_time(model: BaseModel) -> None:
     """Checks that a row in which nothing is observed changes no other prediction.
+
+    Args:
+        model: trained or not.
 
     Raises:
         InputError: it would change one.

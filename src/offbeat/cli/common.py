@@ -68,6 +68,28 @@ def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str,
     return {**kept, **given}
 
 
+def known_options(
+    data: Path, reader: dict[str, Any] | None = None, *, run: Path | None = None
+) -> list[str]:
+    """The options that the reader of a log has and that neither the user nor the run gives.
+
+    Args:
+        data: the file.
+        reader: options given.
+        run: folder of a run, whose options apply as in `read_log`.
+
+    Raises:
+        FileFormatError: no reader supports the file, or the options of the run are damaged.
+    """
+    from offbeat.data.readers import READERS, reader_of
+    from offbeat.data.source import require_source
+
+    given = reader_options(reader, run)
+    named = given.get("format")
+    found = reader_of(require_source(data)) if named is None else READERS[named]
+    return [option for option in found.options if option not in given]
+
+
 def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) -> dict[str, Any]:
     """The table that commands write: times, one column per channel, and its observed mask.
 

@@ -9,6 +9,7 @@ from offbeat.cli.common import (
     answer_columns,
     check_figure,
     check_out,
+    known_options,
     one_trajectory,
     plotted_channels,
     read_log,
@@ -22,6 +23,7 @@ def impute_command(
     data: Path,
     out: Path,
     mode: str | None = None,
+    rate_hz: float | None = None,
     figure: Path | None = None,
     channels: list[str] | None = None,
     trajectory: int = 0,
@@ -39,6 +41,9 @@ def impute_command(
             filled.
         mode: causal, from the past alone; two_sided, from past and future, which needs a run
             trained with --two_sided. By default two_sided where the run is.
+        rate_hz: add rows at this rate where no row is within half a period, so that times at which
+            no sensor reported are filled too. The log is then not split at outages, unless
+            --reader.max_gap_s is given.
         figure: .png, .pdf or .svg of one trajectory, its fills, linear interpolation and PCHIP.
         channels: to plot; by default the first four.
         trajectory: to plot, counted from 0.
@@ -55,8 +60,10 @@ def impute_command(
     check_figure(figure)
     check_seed(seed)
     loaded = load_run(model)
+    if rate_hz is not None and "max_gap_s" in known_options(data, reader, run=model):
+        reader = {"max_gap_s": None, **(reader or {})}
     dataset = read_log(data, reader, run=model)
-    filled = impute(loaded, dataset, mode=mode, seed=seed)  # type: ignore[arg-type]
+    filled = impute(loaded, dataset, mode=mode, rate_hz=rate_hz, seed=seed)  # type: ignore[arg-type]
     chosen = plotted_channels(filled.names, channels)
     one_trajectory(dataset, trajectory)
     write_table(out, answer_columns(dataset, filled))
@@ -66,7 +73,9 @@ def impute_command(
     result = {"written": str(out), "mode": how, "filled": filled_values, "values": total}
     text = f"{out}: {filled_values} of {total} values filled ({how})"
     if figure is not None:
-        fill_figure(loaded, dataset, figure, chosen, trajectory, mode=how, seed=seed)
+        fill_figure(
+            loaded, dataset, figure, chosen, trajectory, mode=how, rate_hz=rate_hz, seed=seed
+        )
         result["figure"] = str(figure)
         text += f"; {figure}"
     say(result, text, json)

@@ -74,6 +74,7 @@ def fill_figure(
     number: int,
     *,
     mode: str | None = None,
+    rate_hz: float | None = None,
     seed: int = 0,
 ) -> None:
     """Plots one trajectory: its masked values, the model's fill and interpolations.
@@ -85,12 +86,13 @@ def fill_figure(
         channels: to plot.
         number: of the trajectory.
         mode: as of `impute`.
+        rate_hz: as of `impute`.
         seed: of models with self-feeding.
     """
     forward = model.forward if isinstance(model, TwoSided) else model
     truth = dataset.select(forward.names)[number]
     one = replace(dataset, trajectories=(dataset[number],))
-    filled = impute(model, one, mode=mode, seed=seed)  # type: ignore[arg-type]
+    filled = impute(model, one, mode=mode, rate_hz=rate_hz, seed=seed)  # type: ignore[arg-type]
     drawn = {"last_value": _filled(truth, "last_value", forward)}
     drawn |= {name: _filled(truth, name, forward) for name in ("linear", "pchip")}
     drawn[str(filled.meta["filled"])] = filled[0]
