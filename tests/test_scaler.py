@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from model_helpers import dataset
+from scipy.stats.mstats import winsorize
 
-from offbeat import Dataset, InputError, Scaler, Trajectory
+from offbeat import Dataset, InputError, Scaler, Trajectory, make_model
+from offbeat.data.scaler import clipped
 
 NAN = float("nan")
-KINDS = ("standardise", "min_max", "divide_by_max", "identity")
+KINDS = ("standardise", "robust", "min_max", "divide_by_max", "identity")
 
 
 def observed_values(data: Dataset, channel: int) -> list[float]:
@@ -33,6 +35,7 @@ def test_a_scaler_is_its_formula_over_the_observed_values(kind: str) -> None:
         values = np.array(observed_values(data, channel))
         shift, scale = {
             "standardise": (values.mean(), values.std()),
+            "robust": (np.median(values), values.std()),  # 98 of 100 is all of a few values
             "min_max": (values.min(), values.max() - values.min()),
             "divide_by_max": (values.min(), values.max()),
             "identity": (0.0, 1.0),
@@ -87,13 +90,58 @@ def test_a_channel_that_is_never_observed_is_named(kind: str) -> None:
         Scaler.fit(kind, data)
 
 
-@pytest.mark.parametrize("kind", ["standardise", "min_max"])
+@pytest.mark.parametrize("kind", ["standardise", "robust", "min_max"])
 @pytest.mark.parametrize("value", [0.0, 0.1, -3.7, 1e9])
 def test_a_channel_that_never_moves_keeps_its_size(kind: str, value: float) -> None:
     data = Dataset((Trajectory(np.arange(30.0), np.full((30, 1), value)),))
     scaler = Scaler.fit(kind, data)
     assert scaler.scale.tolist() == [1.0]
     assert scaler.shift == pytest.approx([value])
+
+
+def one_column(values: np.ndarray) -> Dataset:
+    return Dataset((Trajectory(np.arange(float(len(values))), values[:, None]),))
+
+
+@pytest.mark.parametrize("size", [150, 1000, 20_000])
+@pytest.mark.parametrize("wild", [-999.0, 1e30, 65535.0])
+def test_a_few_wild_values_do_not_change_a_robust_scale(size: int, wild: float) -> None:
+    clean = np.random.default_rng(size).normal(20.0, 3.0, size)
+    dirty = clean.copy()
+    dirty[np.linspace(5, size - 5, min(7, max(2, size // 100))).astype(int)] = wild
+    own, other = (Scaler.fit("robust", one_column(values)) for values in (clean, dirty))
+    assert own.scale == pytest.approx([clean.std()], rel=0.15)
+    assert other.scale == pytest.approx(own.scale, rel=0.1)
+    assert other.shift == pytest.approx(own.shift, abs=0.2)
+    plain = Scaler.fit("standardise", one_column(dirty))
+    assert plain.scale[0] > 5 * own.scale[0], "the other kind is what the wild values make it"
+
+
+def test_clipped_values_are_scipys_winsorised_ones() -> None:
+    values = np.random.default_rng(0).standard_t(2, 1000)
+    np.testing.assert_array_equal(clipped(values), winsorize(values, limits=(0.01, 0.01)))
+
+
+@pytest.mark.parametrize("on", [0.5, 0.02, 0.002, 0.0005])
+def test_a_switch_keeps_its_scale_however_rarely_it_is_on(on: float) -> None:
+    values = np.zeros(4000)
+    values[: round(on * 4000)] = 1.0
+    scaler = Scaler.fit("robust", one_column(np.random.default_rng(1).permutation(values)))
+    assert scaler.scale == pytest.approx([values.std()])
+    assert scaler.shift == pytest.approx([np.median(values)])
+
+
+def test_a_model_on_a_robust_scale_has_robust_statistics_and_others_keep_theirs() -> None:
+    values = np.random.default_rng(3).normal(20.0, 3.0, 1000)
+    values[::143] = -999.0
+    data = one_column(values)
+    robust = make_model("gru", data, scaler="robust").statistics
+    assert robust.mean == pytest.approx([0.0], abs=0.1)
+    assert robust.std == pytest.approx([1.0], rel=0.01)
+    standard = make_model("gru", data).statistics
+    scaled = (values - values.mean()) / values.std()
+    assert standard.mean == pytest.approx([scaled.mean()], abs=1e-6)
+    assert standard.std == pytest.approx([scaled.std()], rel=1e-6)
 
 
 def test_a_maximum_of_0_cannot_be_divided_by() -> None:

@@ -46,7 +46,8 @@ def sweep_command(
             continued with more.
         split: windows, masked values, and the split; its seed is that of the first repeat.
         training: epochs, optimizer and the rest, where they differ from each model's recipe.
-        scaler: standardise, min_max, divide_by_max or identity; fitted on the training part.
+        scaler: standardise, robust, min_max, divide_by_max or identity; fitted on the training
+            part.
         engine: local (processes of this machine), ray or slurm.
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.

@@ -41,7 +41,8 @@ def train_command(
         model: what the model consists of; only the name is needed.
         training: of epochs, optimizer and the rest, those that differ from the model's recipe.
         split: windows, masked values, and the split into training, validation and test part.
-        scaler: standardise, min_max, divide_by_max or identity, fitted on the training part.
+        scaler: standardise, robust, min_max, divide_by_max or identity; fitted on the training
+            part.
         two_sided: train a second model on reversed trajectories as well, so that impute can fill
             from both sides; it is saved in the folder backward of the run.
         reader: how the log is read; the run keeps these options for the other commands.

@@ -13,8 +13,11 @@ from offbeat.data.arrays import frozen
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
 
-ScalerKind = Literal["standardise", "min_max", "divide_by_max", "identity"]
-SCALERS: tuple[str, ...] = ("standardise", "min_max", "divide_by_max", "identity")
+ScalerKind = Literal["standardise", "robust", "min_max", "divide_by_max", "identity"]
+SCALERS: tuple[str, ...] = ("standardise", "robust", "min_max", "divide_by_max", "identity")
+
+_CLIPPED = (0.01, 0.001, 0.0)
+"""Fractions of the values that `clipped` limits at either end; the first that leaves a spread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +28,7 @@ class Scaler:
     read-only.
 
     Args:
-        kind: `standardise`, `min_max`, `divide_by_max` or `identity`.
+        kind: `standardise`, `robust`, `min_max`, `divide_by_max` or `identity`.
         shift: (channels,) in the channels' units.
         scale: (channels,) in the channels' units, not zero.
     """
@@ -55,9 +58,10 @@ class Scaler:
         """Fits a scaler to the observed values of a data set, per channel.
 
         Args:
-            kind: `standardise`, (x - mean) / standard deviation; `min_max`, (x - min) / (max -
-                min); `divide_by_max`, (x - min) / max, the normalisation of the thesis, kept for
-                comparison; or `identity`.
+            kind: `standardise`, (x - mean) / standard deviation; `robust`, (x - median) / standard
+                deviation of the `clipped` values, which a few wild values do not change; `min_max`,
+                (x - min) / (max - min); `divide_by_max`, (x - min) / max, the normalisation of the
+                thesis, kept for comparison; or `identity`.
             dataset: the training part.
 
         Raises:
@@ -72,6 +76,14 @@ class Scaler:
             deviation = np.sqrt(square)
             # The scale of a constant channel stays 1.
             return cls(kind, mean, np.where(deviation > 1e-12 * np.abs(mean), deviation, 1.0))
+        if kind == "robust":
+            columns = [
+                np.concatenate([t.values[t.observed[:, c], c] for t in dataset])
+                for c in range(dataset.channels)
+            ]
+            deviation = np.array([clipped(column).std() for column in columns])
+            centre = np.array([np.median(column) for column in columns])
+            return cls(kind, centre, np.where(deviation > 1e-12 * np.abs(centre), deviation, 1.0))
         if kind == "min_max":
             return cls(kind, low, np.where(high > low, high - low, 1.0))
         if (high == 0).any():
@@ -97,6 +109,29 @@ class Scaler:
     def from_dict(cls, value: Mapping[str, Any]) -> Scaler:
         """The inverse of `to_dict`."""
         return cls(value["kind"], np.array(value["shift"]), np.array(value["scale"]))
+
+
+def clipped(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values limited to their inner 98 % (winsorised): wild ones count as the largest usual ones.
+
+    At either end, 1 % of the values, and at least two where there are 100, are set to the nearest
+    of the others. Where the others are all equal, as of a switch that is rarely on, it is 0.1 %, or
+    none. See Tukey, Ann. Math. Statist. 33 (1962) 1, section 14.
+
+    Args:
+        values: (n,) at least one, finite.
+
+    Returns:
+        (n,) in the same order.
+    """
+    ordered = np.sort(values)
+    low, high = ordered[0], ordered[-1]
+    for fraction in _CLIPPED:
+        cut = max(int(len(values) * fraction), min(2, len(values) // 50) if fraction else 0)
+        low, high = ordered[cut], ordered[len(values) - 1 - cut]
+        if low < high:
+            break
+    return np.clip(values, low, high)
 
 
 def check_observed(names: Sequence[str], count: NDArray[np.int64], trajectories: int) -> None:

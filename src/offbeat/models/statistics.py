@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from offbeat.data.batch import Batch, last_index
+from offbeat.data.scaler import clipped
 from offbeat.errors import InputError
 
 
@@ -38,8 +39,13 @@ class Statistics:
         return len(self.mean)
 
     @classmethod
-    def of(cls, batch: Batch) -> Statistics:
+    def of(cls, batch: Batch, *, robust: bool = False) -> Statistics:
         """Measures a training batch.
+
+        Args:
+            batch: scaled.
+            robust: whether mean and standard deviation are those of the `clipped` values, which a
+                few wild values do not change.
 
         Raises:
             InputError: a channel is never observed, or no trajectory has two rows.
@@ -55,6 +61,10 @@ class Statistics:
         mean = torch.where(mask, values, 0.0).sum(dim=(0, 1)) / count
         variance = (torch.where(mask, values - mean, 0.0) ** 2).sum(dim=(0, 1)) / count
         std = variance.sqrt()
+        if robust:
+            inner = [clipped(values[..., c][mask[..., c]].cpu().numpy()) for c in range(len(count))]
+            mean = torch.tensor([column.mean() for column in inner])
+            std = torch.tensor([column.std() for column in inner])
         std = torch.where(std > 1e-7 * mean.abs().clamp_min(1e-30), std, 1.0)
         gaps = (batch.times[:, 1:] - batch.times[:, :-1])[batch.valid[:, 1:]]
         if not len(gaps):

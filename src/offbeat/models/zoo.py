@@ -301,7 +301,7 @@ def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
         train.units,
         batch.roles,
         scaler,
-        Statistics.of(batch),
+        Statistics.of(batch, robust=scaler.kind == "robust"),
         Transforms.of(train),
     )
 

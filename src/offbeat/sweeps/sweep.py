@@ -163,8 +163,8 @@ def sweep(
         training: of all models, or by label; fields left at None follow the model's recipe. The
             weights with the best validation error are kept.
         epochs: replaces those of `training`.
-        scaler: `standardise`, `min_max`, `divide_by_max` or `identity`, fitted on the training part
-            of each repeat.
+        scaler: `standardise`, `robust`, `min_max`, `divide_by_max` or `identity`, fitted on the
+            training part of each repeat.
         engine: `local`, `ray` or `slurm`; all give the same numbers. The workers of a cluster must
             see `out` under the same path.
         processes: runs at a time; by default as many as cores and memory allow.
