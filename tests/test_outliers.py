@@ -224,6 +224,10 @@ def test_offset_and_scale_do_not_change_what_counts_as_a_spike(seed):
     assert np.array_equal(found.rows[0], moved.rows[0])
 
 
+def test_the_largest_floats_are_compared_without_overflow():
+    assert search([np.array([1.797e308, -1.797e308, 3.0, -1e292])]) == []
+
+
 def test_what_is_not_certain_is_reported_and_kept():
     values = placed(smooth(), -100.0, [3, 50, 51, 1200])
     (found,) = find_outliers(dataset(values))
@@ -234,3 +238,53 @@ def test_what_is_not_certain_is_reported_and_kept():
 def test_an_action_is_never_masked():
     data = dataset(placed(smooth(), -999.0, [3]), roles=("action",))
     assert find_outliers(data) == ()
+
+
+# --- while reading --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def log(tmp_path):
+    """An angle, a height and a temperature, with -999, 65535, 1e30 and zeros at the start."""
+    angle = (2 * TIMES + np.pi) % (2 * np.pi) - np.pi
+    values = [
+        placed(angle, -999.0, [100, 101, 900]),
+        placed(placed(smooth(), 65535.0, [5]), 1e30, [44]),
+        placed(smooth(2, 19, 22), 0.0, slice(0, 10)),
+    ]
+    table = np.column_stack([TIMES, *values])
+    path = tmp_path / "log.csv"
+    head = "time,yaw [rad],height [m],temp"
+    np.savetxt(path, table, delimiter=",", header=head, comments="", fmt="%.9g")
+    return path
+
+
+def test_a_reader_reports_outliers_and_masks_them_if_asked(log):
+    kept, masked = ob.read(log), ob.read(log, outliers="mask")
+    assert kept[0].known.all()
+    assert (~masked[0].known).sum(axis=0).tolist() == [3, 2, 10]
+    for data, option in ((kept, "keep"), (masked, "mask")):
+        entry = data.meta["cleaning"]["outliers"]
+        assert entry["option"] == option
+        assert [(o["name"], o["kind"]) for o in entry["found"]] == [
+            ("yaw", "sentinel"),
+            ("height", "sentinel"),
+            ("height", "sentinel"),
+            ("temp", "start"),
+        ]
+    said = " ".join(ob.inspect(kept).found)
+    assert "15 values of yaw, height, temp are no measurements; they were kept" in said
+    assert "they are missing now" in " ".join(ob.inspect(masked).found)
+
+
+def test_an_angle_is_unwrapped_after_its_sentinels_are_masked(log):
+    data = ob.read(log, outliers="mask", angles=["yaw"])
+    yaw = data[0].values[:, 0]
+    np.testing.assert_allclose(yaw, np.where(np.isnan(yaw), np.nan, 2 * TIMES), atol=1e-6)
+    # Without, each -999 counts as turns.
+    assert np.abs(ob.read(log, angles=["yaw"])[0].values[:, 0] - 2 * TIMES).max() > 1
+
+
+def test_a_wrong_choice_is_refused(log):
+    with pytest.raises(ob.InputError, match="unknown outliers 'drop'"):
+        ob.read(log, outliers="drop")

@@ -192,6 +192,11 @@ def search(columns: Sequence[Values]) -> list[Found]:
     Args:
         columns: (rows,) its values in each episode, NaN = missing.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # values up to the largest float
+        return _search(columns)
+
+
+def _search(columns: Sequence[Values]) -> list[Found]:
     known = np.concatenate([column[~np.isnan(column)] for column in columns])
     if len(known) < 2 or not _has_a_gap(known):
         return []

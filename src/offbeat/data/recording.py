@@ -21,6 +21,7 @@ from offbeat.data.cleaning.described import Channels
 from offbeat.data.cleaning.log import CleaningLog
 from offbeat.data.cleaning.merging import Episode, cut
 from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
+from offbeat.data.outliers import search
 from offbeat.data.signals import Recording as Recording
 from offbeat.data.signals import Signal as Signal
 from offbeat.data.trajectory import Dataset
@@ -32,8 +33,8 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
     """Makes a data set from recordings: merges their signals and cleans them.
 
     In this order: clock jumps, late rows and duplicates of each signal; the union of stamps;
-    outages; actions, repeated values, angles and quaternions per episode; resampling. Whether a
-    channel repeats its values is found over all recordings together.
+    outages; actions, outliers, repeated values, angles and quaternions per episode; resampling.
+    Outliers, and whether a channel repeats its values, are found over all recordings together.
 
     The arrays of a recording with one signal and nothing to clean become those of its trajectory,
     and read-only; otherwise there is at most one copy of the recordings besides the result.
@@ -72,6 +73,7 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
         )
     for episode in episodes:
         _extend_actions(episode, channels)
+    _find_outliers(episodes, channels, options, log)
     _mask_repeats(episodes, channels, options, log)
     if options.unwrap:
         _unwrap(episodes, channels, log)
@@ -105,6 +107,22 @@ def _extend_actions(episode: Episode, channels: Channels) -> None:
         first = int(np.argmin(missing))
         column = episode.own()[:, c]
         column[:] = column[np.where(latest < 0, first, latest)]
+
+
+def _find_outliers(
+    episodes: list[Episode], channels: Channels, options: ReaderOptions, log: CleaningLog
+) -> None:
+    zeros = [e.stamps[0] if options.start == "first_row" else 0 for e in episodes]
+    for c, name in enumerate(channels.names):
+        if channels.roles[c] == "action":
+            continue
+        for found in search([episode.values[:, c] for episode in episodes]):
+            times = [(e.stamps - zero) / 1e9 for e, zero in zip(episodes, zeros, strict=True)]
+            outliers = found.described(name, times)
+            log.outliers.append(outliers.to_dict())
+            if options.outliers == "mask" and outliers.masked:
+                for episode, rows in zip(episodes, found.rows, strict=True):
+                    episode.own()[rows, c] = np.nan
 
 
 def _mask_repeats(

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from offbeat.data.cleaning.options import ReaderOptions
+from offbeat.data.outliers import Outliers
 
 
 @dataclass
@@ -23,6 +24,7 @@ class CleaningLog:
         left_out: rows of each episode that was too short.
         empty: recordings without a row.
         infinite: infinite values.
+        outliers: values that are no measurements, see `offbeat.data.outliers`.
         repeated: of each channel with repeated values, their fraction and the rows per value.
         masked: repeated values that no longer count as measured.
         turns: jumps by a turn that were removed from each angle.
@@ -42,6 +44,7 @@ class CleaningLog:
     left_out: list[int] = field(default_factory=list)
     empty: int = 0
     infinite: int = 0
+    outliers: list[dict[str, Any]] = field(default_factory=list)
     repeated: dict[str, dict[str, float]] = field(default_factory=dict)
     masked: int = 0
     turns: Counter[str] = field(default_factory=Counter)
@@ -82,6 +85,7 @@ class CleaningLog:
                 "without_rows": self.empty,
             },
             "infinite": {"option": o.infinite, "values": self.infinite},
+            "outliers": {"option": o.outliers, "found": self.outliers},
             "repeated": {"option": o.repeated, "channels": self.repeated, "masked": self.masked},
             "angles": {
                 "unwrap": o.unwrap,
@@ -155,6 +159,21 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
         lines.append(f"{left['without_rows']} recordings without a row were left out")
     if cleaning["infinite"]["values"]:
         lines.append(f"{cleaning['infinite']['values']} infinite values count as missing")
+    outliers = cleaning.get("outliers", {"found": ()})  # data sets of 0.2.0 have none
+    certain = [Outliers.from_dict(found) for found in outliers["found"]]
+    certain = [found for found in certain if found.masked]
+    if certain:
+        values = sum(found.count for found in certain)
+        done = (
+            "they are missing now"
+            if outliers["option"] == "mask"
+            else "they were kept (outliers=mask masks them)"
+        )
+        names = list(dict.fromkeys(found.name for found in certain))
+        lines.append(
+            f"{'1 value' if values == 1 else f'{values} values'} of {listed(names)} are no "
+            f"measurements; {done}"
+        )
     repeated = cleaning["repeated"]
     if repeated["channels"]:
         done = (

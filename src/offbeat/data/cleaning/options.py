@@ -46,6 +46,9 @@ class ReaderOptions:
             are one rotation) and length 1, and treats one of length 0 as missing; `keep` does not
             change them.
         infinite: treat an infinite value as `missing`, or `refuse` the file.
+        outliers: values that are no measurements, such as -999 or 1e30 far from all others, zeros
+            before the first measurement, and spikes (see `offbeat.data.outliers`): `keep` them, or
+            `mask` them, so that they are missing. `offbeat train` masks them by default.
         start: times start at the `first_row` of each episode, or are those of the recording's
             own `clock`.
         resample_hz: rows at this rate instead of at the time stamps; each row has the last values
@@ -69,6 +72,7 @@ class ReaderOptions:
     angles: tuple[str, ...] = ()
     quaternions: Literal["continuous", "keep"] = "continuous"
     infinite: Literal["missing", "refuse"] = "missing"
+    outliers: Literal["keep", "mask"] = "keep"
     start: Literal["first_row", "clock"] = "first_row"
     resample_hz: float | None = None
 
@@ -114,6 +118,7 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
     "repeated": ("keep", "mask"),
     "quaternions": ("continuous", "keep"),
     "infinite": ("missing", "refuse"),
+    "outliers": ("keep", "mask"),
     "start": ("first_row", "clock"),
 }
 
