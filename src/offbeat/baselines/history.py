@@ -96,7 +96,16 @@ class AgeBins:
         Args:
             tasks: as of `Baseline.fit`.
         """
-        gap, longest = typical_gap(tasks), longest_age(tasks)
+        return cls.of_lengths(typical_gap(tasks), longest_age(tasks))
+
+    @classmethod
+    def of_lengths(cls, gap: float, longest: float) -> AgeBins:
+        """Bins up to a length.
+
+        Args:
+            gap: s, typical one.
+            longest: s.
+        """
         count = int(
             np.clip(np.ceil(np.log2(max(longest / (1.5 * gap), 1.0)) - 0.3), 0, LONGEST_BIN)
         )

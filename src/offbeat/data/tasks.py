@@ -169,3 +169,16 @@ def _lengths(config: TaskConfig, count: int, random: np.random.Generator) -> NDA
     """s, log-uniform from 1.5 typical gaps to the horizon."""
     low, high = 1.5 * config.gap_s, max(config.horizon_s, 2 * config.gap_s)
     return np.exp(random.uniform(np.log(low), np.log(high), size=count))
+
+
+def take_tasks(tasks: Dataset, index: Sequence[int] | NDArray[np.int64]) -> Dataset:
+    """Some of the tasks that `draw_tasks` drew, with what it noted about them.
+
+    Args:
+        tasks: drawn.
+        index: positions.
+    """
+    taken, notes = tasks.take(index), tasks.meta.get("tasks")
+    if notes is None:
+        return taken
+    return replace(taken, meta={**taken.meta, "tasks": [notes[int(i)] for i in index]})

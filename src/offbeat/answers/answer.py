@@ -1,0 +1,111 @@
+"""`Answer`: a predicted trajectory with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.answers.intervals import HalfWidths, crps, half_width
+from offbeat.data.trajectory import Trajectory
+from offbeat.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Answer(Trajectory):
+    """A trajectory of predictions, with their intervals where they were fitted.
+
+    Args:
+        widths: half widths of intervals in units of an error, or None without intervals.
+        key: (rows, channels) kind of each value, for `widths`.
+        unit: (rows, channels) unit of its error, in original units; 0 where it was observed.
+        beyond: (rows, channels) bool, True where a prediction is for a longer time since
+            observation than was trained and validated, or at the limit of the range of training.
+    """
+
+    widths: HalfWidths | None = None
+    key: NDArray[np.int64] | None = None
+    unit: Array | None = None
+    beyond: NDArray[np.bool_] | None = None
+
+    def half_width(self, level: float = 0.9) -> Array:
+        """Half the width of the interval that holds the true value with a probability.
+
+        Args:
+            level: the probability, at most 0.98.
+
+        Returns:
+            (rows, channels) in original units; 0 where the value was observed.
+
+        Raises:
+            InputError: the level is out of range, or the answer has no intervals.
+        """
+        return half_width(self._levels(), level)
+
+    def interval(self, level: float = 0.9) -> tuple[Array, Array]:
+        """Lower and upper end of the interval that holds the true value with a probability.
+
+        Args:
+            level: the probability, at most 0.98.
+
+        Returns:
+            (rows, channels) each, in original units.
+
+        Raises:
+            InputError: the level is out of range, or the answer has no intervals.
+        """
+        half = self.half_width(level)
+        return self.values - half, self.values + half
+
+    def crps(self, truth: Array) -> Array:
+        """(rows, channels) continuous ranked probability score, in original units.
+
+        Args:
+            truth: (rows, channels).
+        """
+        return crps(self._levels(), truth - self.values)
+
+    def _levels(self) -> Array:
+        if self.widths is None or self.key is None or self.unit is None:
+            raise InputError(
+                "these predictions have no intervals: they are of a model alone; fit a blend "
+                "(offbeat train, offbeat.fit_blend), whose answers have them"
+            )
+        return self.widths.at(self.key, self.unit)
+
+    def slice(self, start: int, stop: int) -> Answer:
+        """The rows from `start` up to, not including, `stop`."""
+        return self.rows_at(np.arange(self.rows)[start:stop])
+
+    def rows_at(self, rows: NDArray[np.int64]) -> Answer:
+        """These rows, in increasing order."""
+        return replace(
+            self,
+            times=self.times[rows],
+            values=self.values[rows],
+            observed=None if self.observed is None else self.observed[rows],
+            key=None if self.key is None else self.key[rows],
+            unit=None if self.unit is None else self.unit[rows],
+            beyond=None if self.beyond is None else self.beyond[rows],
+        )
+
+    def select(self, index: Sequence[int]) -> Answer:
+        """The channels at these positions, in this order."""
+        order = list(index)
+        widths = self.widths
+        return replace(
+            self,
+            values=self.values[:, order],
+            observed=None if self.observed is None else self.observed[:, order],
+            names=tuple(self.names[i] for i in order),
+            units=tuple(self.units[i] for i in order),
+            roles=tuple(self.roles[i] for i in order),
+            widths=None if widths is None else replace(widths, table=widths.table[:, order]),
+            key=None if self.key is None else self.key[:, order],
+            unit=None if self.unit is None else self.unit[:, order],
+            beyond=None if self.beyond is None else self.beyond[:, order],
+        )

@@ -1,0 +1,323 @@
+"""The blend: one predictor for every task, base + gamma (model - base), with intervals.
+
+The base is a weighted mean of baselines: causal ones (`baselines.stack`) for predictions, causal
+fills, forecasts and streams, and those that use both sides (`both_sides`) for fills of a recording.
+gamma, from 0 to 1 per channel and kind of value, is how much of the model's difference from the
+base improves it on validation data. So the answer is that of simple predictors where a model has
+nothing to add, and `gamma` says where that is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from offbeat.answers.answer import Answer
+from offbeat.answers.both_sides import (
+    BothSides,
+    Filled,
+    Sides,
+    fit_both_sides,
+    gated,
+    reversed_in_time,
+)
+from offbeat.answers.intervals import HalfWidths, fit_half_widths
+from offbeat.baselines.base import Array
+from offbeat.baselines.history import typical_gap
+from offbeat.baselines.stack import Stack, errors_of, fit_stack, independent_tasks, kinds_of, within
+from offbeat.data.tasks import CAUSAL, TWO_SIDED, TaskConfig, draw_tasks
+from offbeat.data.trajectory import Dataset
+from offbeat.data.transforms import Transforms
+from offbeat.errors import InputError
+from offbeat.models.base import BaseModel
+
+CAUSAL_MEMBERS = ("last_value", "constant_velocity", "damped_slope", "mean", "running_mean")
+"""Causal baselines of a blend."""
+
+TWO_SIDED_MEMBERS = ("last_value", "linear", "pchip")
+"""Baselines of the fills of a blend."""
+
+TASKS = 800
+"""Tasks that are drawn from the training data and from the validation data, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """A predictor of every task, made of baselines and of one model or two.
+
+    Attributes:
+        names: of the channels.
+        units: of the channels.
+        roles: of the channels.
+        transforms: of the channels.
+        tasks: how the tasks were drawn that it was fitted to.
+        stack: the causal base.
+        gamma: (keys, channels) of the forward model's difference from the base.
+        widths: of the causal intervals.
+        both: what fills from both sides.
+        forward: predicts from the past; None for a blend of baselines alone.
+        backward: trained on reversed trajectories; None without.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    roles: tuple[str, ...]
+    transforms: Transforms
+    tasks: TaskConfig
+    stack: Stack
+    gamma: Array
+    widths: HalfWidths
+    both: BothSides
+    forward: BaseModel | None = None
+    backward: BaseModel | None = None
+
+    @property
+    def name(self) -> str:
+        """Its name in tables."""
+        return "blend"
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return len(self.names)
+
+    def causal(self, dataset: Dataset, *, seed: int = 0) -> list[Answer]:
+        """Predicts every row from what was observed strictly before it.
+
+        Args:
+            dataset: transformed, of these channels in this order; masked values are not used.
+            seed: of the generator of self-feeding.
+        """
+        models = model_rows(self.forward, dataset, seed=seed)
+        channel = np.arange(self.channels)
+        units = self.stack.keys.units()
+        longest = float(self.stack.keys.bins.edges[-1]) * (1 + 1e-6)
+        answers = []
+        kinds = kinds_of(self.stack.keys, dataset)
+        every = zip(dataset, self.stack.predict(dataset), kinds, strict=True)
+        for i, (trajectory, base, kind) in enumerate(every):
+            key, age, last = kind[..., 0].astype(np.int64), kind[..., 2], kind[..., 3]
+            values, beyond = base, age > longest
+            if models is not None:
+                gamma = np.where(beyond, 0.0, self.gamma[key, channel])
+                values = self.stack.bounded(base + gamma * (models[i] - base), last)
+            edge = (values <= self.stack.low) | (values >= self.stack.high)
+            unit = units[key, channel] * kind[..., 1] ** 0.25
+            answers.append(self._answer(trajectory, values, self.widths, key, unit, beyond | edge))
+        return answers
+
+    def fill(self, dataset: Dataset, *, seed: int = 0) -> list[Answer]:
+        """Predicts every value that is not observed, from the observations on both sides.
+
+        Args:
+            dataset: as of `causal`.
+            seed: of the generator of self-feeding.
+        """
+        causal = [answer.values for answer in self.causal(dataset, seed=seed)]
+        models = model_fills(self.forward, self.backward, dataset, seed=seed)
+        channel = np.arange(self.channels)
+        answers = []
+        longest = float(self.both.keys.bins.edges[-1]) * (1 + 1e-6)
+        for trajectory, (values, key) in zip(
+            dataset, self.both.fill(dataset, causal, models), strict=True
+        ):
+            sides = Sides.of(trajectory)
+            near = np.where(sides.before, trajectory.values[sides.earlier, channel], np.nan)
+            near = np.where(sides.before, near, trajectory.values[sides.later, channel])
+            near = np.where(sides.before | sides.after, near, self.stack.mean)
+            values = self.stack.bounded(values, np.nan_to_num(near))
+            unit = self.both.units[key, channel]
+            answers.append(
+                self._answer(
+                    trajectory, values, self.both.widths, key, unit, sides.length > longest
+                )
+            )
+        return answers
+
+    def _answer(
+        self,
+        trajectory: Any,
+        values: Array,
+        widths: HalfWidths,
+        key: NDArray[np.int64],
+        unit: Array,
+        beyond: NDArray[np.bool_],
+    ) -> Answer:
+        return Answer(
+            trajectory.times,
+            values,
+            names=self.names,
+            units=self.units,
+            roles=self.roles,
+            origin=trajectory.origin,
+            widths=widths,
+            key=key,
+            unit=unit,
+            beyond=beyond,
+        )
+
+    def arrays(self) -> dict[str, Array]:
+        """All tables, by name; models are not among them."""
+        own = {"gamma": self.gamma, "widths": self.widths.table, "widths_count": self.widths.count}
+        own |= {f"stack.{k}": v for k, v in self.stack.arrays().items()}
+        return own | {f"both.{k}": v for k, v in self.both.arrays().items()}
+
+    def restored(self, arrays: Mapping[str, Array]) -> Blend:
+        """This blend with other tables."""
+        return replace(self, **tables_of(arrays))
+
+
+def tables_of(arrays: Mapping[str, Array]) -> dict[str, Any]:
+    """Fields of a blend from `Blend.arrays`."""
+    return {
+        "gamma": arrays["gamma"],
+        "widths": HalfWidths(arrays["widths"], arrays["widths_count"]),
+        "stack": Stack().restore(within(arrays, "stack.")),
+        "both": BothSides.restored(within(arrays, "both.")),
+    }
+
+
+def fit_blend(
+    train: Dataset,
+    validation: Dataset,
+    model: BaseModel | None = None,
+    backward: BaseModel | None = None,
+    *,
+    tasks: TaskConfig | None = None,
+    causal: Sequence[str] = CAUSAL_MEMBERS,
+    two_sided: Sequence[str] = TWO_SIDED_MEMBERS,
+    count: int = TASKS,
+    seed: int = 0,
+) -> Blend:
+    """Fits the base to training and validation data, and gamma and intervals to validation data.
+
+    Args:
+        train: what the model was trained on.
+        validation: other data.
+        model: trained; None for baselines alone.
+        backward: trained on reversed trajectories; without one, a fill from both sides uses the
+            forward model's causal predictions alone.
+        tasks: how tasks are drawn; by default with a horizon of sixteen typical gaps.
+        causal: names of the causal baselines.
+        two_sided: names of the baselines of fills.
+        count: tasks that are drawn from each part, at most.
+        seed: of the tasks.
+
+    Raises:
+        InputError: the parts have other channels than the model.
+    """
+    train, validation = Dataset.of(train), Dataset.of(validation)
+    transforms = model.transforms if model is not None else Transforms.of(train)
+    if model is not None:
+        if set(train.names) != set(model.names):
+            raise InputError(
+                f"the data has channels {', '.join(train.names)}, the model was made for "
+                f"{', '.join(model.names)}; give both the same"
+            )
+        train, validation = train.select(model.names), validation.select(model.names)
+    train, validation = transforms.apply(train), transforms.apply(validation)
+    gap = typical_gap(train)
+    config = tasks or TaskConfig(horizon_s=16 * gap, gap_s=gap)
+    span = sum(float(t.times[-1] - t.times[0]) + gap for t in [*train, *validation])
+    validation_span = sum(float(t.times[-1] - t.times[0]) + gap for t in validation)
+
+    def drawn(shares: dict[str, float], salt: int) -> list[Dataset]:
+        return [
+            draw_tasks(
+                part,
+                config,
+                number_of_tasks(part, config, count),
+                shares=shares,
+                seed=[seed, salt, i],
+            )
+            for i, part in enumerate((train, validation))
+        ]
+
+    parts = drawn(CAUSAL, 0)
+    stack, cells, held_out = fit_stack(causal, *parts, span_s=span, gap_s=gap)
+    models = model_rows(model, parts[1], seed=seed)
+    count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
+    base = stack.predict(parts[1])
+    errors = errors_of(cells, [held_out, base], count_of)
+    gamma, answer = gated(
+        errors,
+        errors.predictions[:, 0],
+        errors.predictions[:, 1],
+        None if models is None else cells.pick(models),
+        train.channels,
+    )
+    blend = Blend(
+        train.names,
+        train.units,
+        train.roles,
+        transforms,
+        config,
+        stack,
+        gamma,
+        fit_half_widths(errors, answer, train.channels),
+        both=None,  # type: ignore[arg-type]  # below
+        forward=model,
+        backward=backward,
+    )
+    sides = [
+        Filled(
+            part,
+            [a.values for a in blend.causal(part, seed=seed)],
+            model_fills(model, backward, part, seed=seed),
+        )
+        for part in drawn(TWO_SIDED, 1)
+    ]
+    return replace(
+        blend, both=fit_both_sides(two_sided, sides[0], sides[1], span_s=span, gap_s=gap)
+    )
+
+
+def number_of_tasks(part: Dataset, config: TaskConfig, most: int) -> int:
+    """Tasks that cover a part about four times, from 100 to `most`."""
+    span = sum(float(t.times[-1] - t.times[0]) for t in part)
+    return int(np.clip(4 * span / config.length_s, min(100, most), most))
+
+
+def model_rows(
+    model: BaseModel | None, dataset: Dataset, *, seed: int = 0, size: int = 500
+) -> list[Array] | None:
+    """A model's predictions of every row, in original units; None without a model.
+
+    Args:
+        model: trained.
+        dataset: transformed, in the order of the model's channels.
+        seed: of the generator of self-feeding.
+        size: trajectories per batch.
+    """
+    if model is None:
+        return None
+    results = []
+    for first in range(0, len(dataset), size):
+        part = dataset[first : first + size]
+        drawn = {"generator": torch.Generator().manual_seed(seed)} if model.needs_generator else {}
+        with torch.inference_mode():
+            scaled = model(model.batch(part), **drawn).mean.double().cpu().numpy()
+        results += [
+            model.scaler.original(values[: t.rows]) for t, values in zip(part, scaled, strict=True)
+        ]
+    return results
+
+
+def model_fills(
+    forward: BaseModel | None, backward: BaseModel | None, dataset: Dataset, *, seed: int = 0
+) -> list[Array] | None:
+    """The fills of both models joined, or those of the forward model; None without models."""
+    ahead = model_rows(forward, dataset, seed=seed)
+    if ahead is None or backward is None:
+        return ahead
+    back = model_rows(backward, reversed_in_time(dataset), seed=seed)
+    assert back is not None
+    return [
+        Sides.of(t).joined(np.where(t.observed, t.values, 0.0), f, b[::-1])
+        for t, f, b in zip(dataset, ahead, back, strict=True)
+    ]

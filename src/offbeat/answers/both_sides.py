@@ -1,0 +1,352 @@
+"""Fills from both sides: baselines that use the future, and two models joined.
+
+A forward model predicts f(t) from what was observed before t, a backward model, trained on
+trajectories reversed in time, b(t) from what was observed after it. Between two observations of a
+channel, x0 at t0 and x1 at t1, with s = (t - t0) / (t1 - t0) and the errors at the other ends
+r_f = x1 - f(t1) and r_b = x0 - b(t0), they are joined as
+
+    (1 - s) f + s b + s (1 - s) ((r_f + r_b) / 2 + (1/2 - s) (r_b - r_f)),
+
+which is the cubic Hermite interpolation with their slopes where both continue straight. After the
+last observation the model's fill is f, before the first one b.
+
+The fill is base + gamma (model - base), as everywhere; here the base is a weighted mean of the
+baselines that use both sides and of the causal answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.answers.intervals import HalfWidths, fit_half_widths
+from offbeat.baselines.base import BASELINES, Array, Baseline, fit_baseline
+from offbeat.baselines.history import AgeBins
+from offbeat.baselines.stack import cross_fitted, independent_tasks, joined, within
+from offbeat.baselines.weights import Errors, gate, simplex_weights
+from offbeat.data.masking import masked_values
+from offbeat.data.trajectory import Dataset, Trajectory
+
+EDGE = 0.15
+"""Values with s (1 - s) below this are near the edge of their gap."""
+
+CAUSAL_ANSWER = "causal"
+"""Name of the causal answer among the predictors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """Where each value of a trajectory is between the observations of its channel.
+
+    All arrays have shape (rows, channels).
+
+    Attributes:
+        before: whether there is an earlier observation.
+        after: whether there is a later one.
+        earlier: row of the last one before, 0 where there is none.
+        later: row of the first one after, the last row where there is none.
+        length: s, between both; outside, to the nearest one; 0 where there is none.
+        place: s in the module's equations; 0 outside.
+    """
+
+    before: NDArray[np.bool_]
+    after: NDArray[np.bool_]
+    earlier: NDArray[np.int64]
+    later: NDArray[np.int64]
+    length: Array
+    place: Array
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Sides:
+        """The place of each value that is not observed; observed ones lie between themselves."""
+        observed, times = trajectory.observed, trajectory.times[:, None]
+        rows = np.arange(trajectory.rows)[:, None]
+        earlier = np.maximum.accumulate(np.where(observed, rows, -1), axis=0)
+        later = np.minimum.accumulate(np.where(observed, rows, trajectory.rows)[::-1], axis=0)[::-1]
+        before, after = earlier >= 0, later < trajectory.rows
+        earlier, later = np.maximum(earlier, 0), np.minimum(later, trajectory.rows - 1)
+        start, end = trajectory.times[earlier], trajectory.times[later]
+        between = before & after & ~observed
+        length = np.where(between, end - start, 0.0)
+        place = np.where(between, (times - start) / np.where(between, length, 1.0), 0.0)
+        length = np.where(before & ~after, times - start, length)
+        length = np.where(after & ~before, end - times, length)
+        return cls(before, after, earlier, later, length, place)
+
+    def joined(self, values: Array, forward: Array, backward: Array) -> Array:
+        """(rows, channels) the two models joined; see the module.
+
+        Args:
+            values: of the trajectory; only observed ones are used.
+            forward: predictions from the past.
+            backward: predictions from the future.
+        """
+        channel = np.arange(values.shape[1])
+        s = self.place
+        missed_ahead = values[self.later, channel] - forward[self.later, channel]
+        missed_back = values[self.earlier, channel] - backward[self.earlier, channel]
+        inside = (
+            (1 - s) * forward
+            + s * backward
+            + s
+            * (1 - s)
+            * (0.5 * (missed_ahead + missed_back) + (0.5 - s) * (missed_back - missed_ahead))
+        )
+        both, none = self.before & self.after, ~(self.before | self.after)
+        alone = np.where(self.before, forward, backward)
+        return np.where(both, inside, np.where(none, (forward + backward) / 2, alone))
+
+
+@dataclass(frozen=True)
+class SideKeys:
+    """Kinds of values: length of the gap, near its edge or not; or outside, the time to it.
+
+    Attributes:
+        bins: of lengths.
+    """
+
+    bins: AgeBins
+
+    def __len__(self) -> int:
+        return 4 * len(self.bins) + 1
+
+    def of(self, sides: Sides) -> NDArray[np.int64]:
+        """(rows, channels) kinds."""
+        at, many = self.bins.of_age(sides.length), len(self.bins)
+        middle = sides.place * (1 - sides.place) >= EDGE
+        key = np.where(middle, at + many, at)
+        key = np.where(sides.before & ~sides.after, at + 2 * many, key)
+        key = np.where(sides.after & ~sides.before, at + 3 * many, key)
+        return np.where(sides.before | sides.after, key, 4 * many).astype(np.int64)
+
+    def lengths(self) -> Array:
+        """(keys,) s."""
+        return np.append(np.tile(self.bins.edges, 4), np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class BothSides:
+    """Everything that fills from both sides.
+
+    Attributes:
+        members: fitted baselines by name.
+        keys: kinds of values.
+        weights: (keys, channels, members + 1) of the members and of the causal answer, the last.
+        gamma: (keys, channels) of the models' difference from the base.
+        widths: of the intervals.
+        units: (keys, channels) usual size of an error, in original units.
+    """
+
+    members: Mapping[str, Baseline]
+    keys: SideKeys
+    weights: Array
+    gamma: Array
+    widths: HalfWidths
+    units: Array
+
+    def fill(
+        self,
+        dataset: Dataset,
+        causal: Sequence[Array],
+        models: Sequence[Array] | None,
+    ) -> list[tuple[Array, NDArray[np.int64]]]:
+        """Fills, and the kinds of the values.
+
+        Args:
+            dataset: in the units and the order of the channels of training.
+            causal: per trajectory (rows, channels) answers from the past.
+            models: the same of `model_fills`, or None without models.
+        """
+        every = [member.predict(dataset) for member in self.members.values()] + [list(causal)]
+        channel = np.arange(dataset.channels)
+        filled = []
+        for i, trajectory in enumerate(dataset):
+            key = self.keys.of(Sides.of(trajectory))
+            weights = self.weights[key, channel]
+            base = sum(weights[..., j] * predicted[i] for j, predicted in enumerate(every))
+            values = np.asarray(base)
+            if models is not None:
+                values = values + self.gamma[key, channel] * (models[i] - values)
+            filled.append((values, key))
+        return filled
+
+    def arrays(self) -> dict[str, Array]:
+        """What is saved."""
+        own = {
+            "edges": self.keys.bins.edges,
+            "weights": self.weights,
+            "gamma": self.gamma,
+            "widths": self.widths.table,
+            "widths_count": self.widths.count,
+            "units": self.units,
+        }
+        for name, member in self.members.items():
+            own |= {f"member.{name}.{k}": v for k, v in member.arrays().items()}
+        return own
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, Array]) -> BothSides:
+        """The inverse of `arrays`."""
+        names = dict.fromkeys(k.split(".")[1] for k in arrays if k.startswith("member."))
+        return cls(
+            {n: BASELINES[n]().restore(within(arrays, f"member.{n}.")) for n in names},
+            SideKeys(AgeBins(arrays["edges"])),
+            arrays["weights"],
+            arrays["gamma"],
+            HalfWidths(arrays["widths"], arrays["widths_count"]),
+            arrays["units"],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Filled:
+    """Tasks of fills and what was predicted of them.
+
+    Attributes:
+        tasks: from `draw_tasks`.
+        causal: per trajectory (rows, channels) answers from the past.
+        models: the same of `model_fills`, or None.
+    """
+
+    tasks: Dataset
+    causal: Sequence[Array]
+    models: Sequence[Array] | None
+
+
+def fit_both_sides(
+    members: Sequence[str],
+    train: Filled,
+    validation: Filled,
+    *,
+    span_s: float,
+    gap_s: float,
+) -> BothSides:
+    """Fits weights to training and validation tasks, gamma and intervals to validation tasks.
+
+    Args:
+        members: names of baselines.
+        train: tasks of the training data.
+        validation: tasks of other data.
+        span_s: s, length of all the data.
+        gap_s: s, its typical gap.
+    """
+    channels = train.tasks.channels
+    keys = SideKeys(AgeBins.of_lengths(gap_s, longest_length(train.tasks)))
+    fitted, predicted, later = {}, [], []
+    for name in members:
+        fitted[name] = fit_baseline(name, train.tasks)
+        flexible = fitted[name].flexible
+        predicted.append(
+            cross_fitted(name, train.tasks) if flexible else fitted[name].predict(train.tasks)
+        )
+        later.append(fitted[name].predict(validation.tasks))
+    count = independent_tasks(keys.lengths(), span_s, gap_s)
+    reference = fit_baseline("linear", train.tasks)
+    scale = reference.scale
+    units = np.broadcast_to(scale, (len(keys), channels)).copy()
+    flat = [
+        _errors(part.tasks, keys, units, reference, [*p, list(part.causal)], part.models, count)
+        for part, p in ((train, predicted), (validation, later))
+    ]
+    first = simplex_weights(flat[0][0], channels)
+    weights = simplex_weights(joined([flat[0][0], flat[1][0]]), channels)
+    errors, models = flat[1]
+    held_out = (first[errors.key, errors.channel] * errors.predictions).sum(axis=1)
+    base = (weights[errors.key, errors.channel] * errors.predictions).sum(axis=1)
+    gamma, answer = gated(errors, held_out, base, models, channels)
+    widths = fit_half_widths(errors, answer, channels)
+    return BothSides(fitted, keys, weights, gamma, widths, units)
+
+
+def gated(
+    errors: Errors, held_out: Array, base: Array, models: Array | None, channels: int
+) -> tuple[Array, Array]:
+    """Gamma of a model, and answers for the intervals with gamma from the other half of the tasks.
+
+    Args:
+        errors: of validation tasks.
+        held_out: (values,) base with weights that were not fitted to them.
+        base: (values,) the base.
+        models: (values,) the model, or None.
+        channels: their number.
+
+    Returns:
+        (keys, channels), and (values,).
+    """
+    if models is None:
+        return np.zeros((errors.keys, channels)), held_out
+    gamma = gate(errors, base, models, channels)
+    answer = held_out.copy()
+    half = errors.task % 2
+    for k in (0, 1):
+        fit, use = half != k, half == k
+        if fit.any():
+            part = gate(errors.only(fit), held_out[fit], models[fit], channels)
+            own = part[errors.key[use], errors.channel[use]]
+            answer[use] += own * (models[use] - held_out[use])
+    return gamma, answer
+
+
+def longest_length(tasks: Dataset) -> float:
+    """The longest length of a gap with masked values, in s."""
+    longest = 0.0
+    for trajectory in tasks:
+        masked = masked_values(trajectory)
+        if masked.any():
+            longest = max(longest, float(Sides.of(trajectory).length[masked].max()))
+    return longest
+
+
+def _errors(
+    tasks: Dataset,
+    keys: SideKeys,
+    units: Array,
+    reference: Baseline,
+    predicted: Sequence[Sequence[Array]],
+    models: Sequence[Array] | None,
+    count: Array,
+) -> tuple[Errors, Array | None]:
+    columns: dict[str, list[NDArray[Any]]] = {
+        n: [] for n in ("key", "channel", "task", "truth", "model")
+    }
+    each: list[Array] = []
+    for i, (trajectory, line) in enumerate(zip(tasks, reference.predict(tasks), strict=True)):
+        row, channel = np.nonzero(masked_values(trajectory))
+        key = keys.of(Sides.of(trajectory))[row, channel]
+        unit, zero = units[key, channel], line[row, channel]
+        columns["key"].append(key)
+        columns["channel"].append(channel)
+        columns["task"].append(np.full(len(row), i))
+        columns["truth"].append((trajectory.values[row, channel] - zero) / unit)
+        each.append(np.stack([(p[i][row, channel] - zero) / unit for p in predicted], axis=1))
+        if models is not None:
+            columns["model"].append((models[i][row, channel] - zero) / unit)
+    flat = {name: np.concatenate(parts) for name, parts in columns.items() if parts}
+    errors = Errors(
+        flat["key"], flat["channel"], flat["task"], flat["truth"], np.concatenate(each), count
+    )
+    return errors, flat.get("model")
+
+
+def reversed_in_time(dataset: Dataset) -> Dataset:
+    """Each trajectory from its end to its start, times counted from its last row.
+
+    Args:
+        dataset: any trajectories; values are not changed, not even the signs of velocities.
+    """
+    return replace(
+        dataset,
+        trajectories=tuple(
+            replace(
+                t,
+                times=t.times[-1] - t.times[::-1],
+                values=t.values[::-1],
+                observed=t.observed[::-1],
+            )
+            for t in dataset
+        ),
+    )

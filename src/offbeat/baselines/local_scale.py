@@ -1,0 +1,110 @@
+"""How much each channel moves at present, compared to how much it usually does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from offbeat.baselines.base import Array, State, namespace, padded, stepped
+from offbeat.baselines.history import AgeBins, History
+from offbeat.baselines.simple import DampedSlope, as_kind
+from offbeat.data.trajectory import Dataset
+
+FORGET = 0.08
+"""Weight of the newest error in the running mean."""
+
+LARGEST = 1e4
+SMALLEST = 1e-6
+
+
+class LocalScale:
+    """A running mean of squared errors one observation ahead, relative to those of training.
+
+    Each observation is predicted by a damped slope; its squared error, divided by the mean one at
+    that time since observation, enters a mean that forgets. The result is 1 where a channel moves
+    as it usually does, near 0 where it rests.
+
+    Attributes:
+        slope: the predictor.
+        usual: (bins, channels) mean squared error of training, in squared units.
+    """
+
+    slope: DampedSlope
+    usual: Array
+
+    def fit(self, tasks: Dataset) -> LocalScale:
+        """Fits to tasks; returns itself.
+
+        Args:
+            tasks: as of `Baseline.fit`.
+        """
+        self.slope = DampedSlope()
+        self.slope.fit(tasks)
+        bins = AgeBins(self.slope.edges)
+        total = np.zeros((len(bins), tasks.channels))
+        count = np.zeros_like(total)
+        channel = np.arange(tasks.channels)
+        for rows in padded(tasks):
+            predicted = stepped(self.slope, rows)
+            age = stepped(_Age(self.slope), rows)
+            counted = rows.known & np.isfinite(age)
+            where = (bins.of_age(age)[counted], np.broadcast_to(channel, age.shape)[counted])
+            np.add.at(total, where, (rows.values - predicted)[counted] ** 2)
+            np.add.at(count, where, 1.0)
+        mean = total / np.maximum(count, 1)
+        # A bin without values takes that of the bin before it.
+        for k in range(1, len(mean)):
+            mean[k] = np.where(count[k] > 0, mean[k], mean[k - 1])
+        floor = 1e-12 * self.slope.scale**2
+        self.usual = np.maximum(mean, floor)
+        return self
+
+    def start(self, like: Any) -> State:
+        """See `CausalBaseline`."""
+        return {**self.slope.start(like), "square": like + 1.0, "seen": like}
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        """See `CausalBaseline`."""
+        xp = namespace(values)
+        predicted = self.slope.read(state, time)
+        at = AgeBins(self.slope.edges).of_age(History.age(state, time))
+        channel = np.arange(len(self.usual[0]))
+        usual = as_kind(self.usual, values)[at, channel if xp is np else xp.arange(len(channel))]
+        error = xp.clip((values - predicted) ** 2 / usual, 0.0, LARGEST)
+        counted = mask & (state["count"] > 1)
+        weight = xp.clip(1.0 / (state["seen"] + 2.0), FORGET, 1.0)
+        square = state["square"] + weight * (error - state["square"])
+        square = xp.clip(square, SMALLEST, LARGEST)
+        after = self.slope.observe(state, time, values, mask)
+        return {
+            **after,
+            "square": xp.where(counted, square, state["square"]),
+            "seen": state["seen"] + counted,
+        }
+
+    def read(self, state: State, time: Any) -> Any:
+        """(batch, channels) squared size of the present motion, 1 where it is as usual."""
+        return state["square"]
+
+    def arrays(self) -> dict[str, Array]:
+        """See `Baseline`."""
+        return {**self.slope.arrays(), "usual": self.usual}
+
+    def restore(self, arrays: Mapping[str, Array]) -> LocalScale:
+        """See `Baseline`."""
+        self.usual = np.asarray(arrays["usual"])
+        self.slope = DampedSlope()
+        self.slope.restore({k: v for k, v in arrays.items() if k != "usual"})
+        return self
+
+
+class _Age:
+    """Reads the time since each channel's last observation."""
+
+    def __init__(self, of: Any) -> None:
+        self.start, self.observe = of.start, of.observe
+
+    def read(self, state: State, time: Any) -> Any:
+        return History.age(state, time)

@@ -1,0 +1,385 @@
+"""The base of every answer: causal baselines, weighted per channel, age and present motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.baselines.base import (
+    BASELINES,
+    Array,
+    CausalBaseline,
+    State,
+    fit_baseline,
+    moments,
+    namespace,
+    padded,
+    stepped,
+)
+from offbeat.baselines.history import AgeBins, History
+from offbeat.baselines.local_scale import LocalScale
+from offbeat.baselines.simple import as_kind
+from offbeat.baselines.weights import Errors, simplex_weights
+from offbeat.data.tasks import take_tasks
+from offbeat.data.trajectory import Dataset
+
+ACTIVITY = (-1.5, -0.5)
+"""Bounds of log10 of the local scale: a channel rests, moves little, or moves as usual."""
+
+LEVELS = len(ACTIVITY) + 1
+
+MARGIN = 0.5
+"""Answers stay within the range of training, widened by this part of it on both sides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The values of a data set that are known, flat, with what is known about them beforehand.
+
+    Attributes:
+        task: (values,) position of the trajectory.
+        row: (values,) its row.
+        channel: (values,) its channel.
+        key: (values,) kind of the value, see `Keys`.
+        square: (values,) local scale.
+        unit: (values,) usual size of an error, in original units.
+        last: (values,) last value, or the training mean.
+        truth: (values,) in original units.
+    """
+
+    task: NDArray[np.int64]
+    row: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    key: NDArray[np.int64]
+    square: Array
+    unit: Array
+    last: Array
+    truth: Array
+
+    def pick(self, predicted: Sequence[Array]) -> Array:
+        """(values,) of predictions, in units of an error since the last value.
+
+        Args:
+            predicted: (rows, channels) per trajectory.
+        """
+        return (values_at(predicted, self) - self.last) / self.unit
+
+
+def values_at(predicted: Sequence[Array], cells: Cells) -> Array:
+    """(values,) of (rows, channels) per trajectory."""
+    starts = np.cumsum([0, *(len(p) for p in predicted)])
+    flat = np.concatenate(predicted)
+    return np.asarray(flat[starts[cells.task] + cells.row, cells.channel])
+
+
+class Keys:
+    """Kinds of values: the bin of the time since observation, and the present motion.
+
+    A value whose channel was never observed before has a kind of its own, the last one.
+
+    Attributes:
+        bins: of the time since observation.
+        local: the present motion.
+    """
+
+    def __init__(self, bins: AgeBins, local: LocalScale) -> None:
+        self.bins, self.local = bins, local
+
+    def __len__(self) -> int:
+        return len(self.bins) * LEVELS + 1
+
+    def start(self, like: Any) -> State:
+        """See `CausalBaseline`."""
+        return self.local.start(like)
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        """See `CausalBaseline`."""
+        return self.local.observe(state, time, values, mask)
+
+    def read(self, state: State, time: Any) -> Any:
+        """(batch, channels, 4) kind, local scale, age and last value."""
+        xp = namespace(state["count"])
+        age, square = History.age(state, time), state["square"]
+        level = 0.0 * square
+        for bound in ACTIVITY:
+            level = level + (square > 10.0**bound)
+        never = xp.isinf(age)
+        key = xp.where(never, float(len(self) - 1), self.bins.of_age(age) * LEVELS + level)
+        last = History.last(state, as_kind(self.local.slope.mean, square))
+        return xp.stack([key, square, age, last], -1)
+
+    def ages(self) -> Array:
+        """(keys,) s, upper end of the bin; infinite for the last kind."""
+        return np.append(np.repeat(self.bins.edges, LEVELS), np.inf)
+
+    def units(self) -> Array:
+        """(keys, channels) usual size of an error, in original units."""
+        usual = np.repeat(self.local.usual, LEVELS, axis=0)
+        return np.sqrt(np.vstack([usual, self.local.slope.scale**2]))
+
+    def cells(self, tasks: Dataset) -> Cells:
+        """The known values of tasks."""
+        parts: list[tuple[NDArray[Any], ...]] = []
+        units, first = self.units(), 0
+        for rows in padded(tasks):
+            read = stepped(self, rows)
+            task, row, channel = np.nonzero(rows.known)
+            key, square, _, last = np.moveaxis(read[task, row, channel], -1, 0)
+            key = key.astype(np.int64)
+            unit = units[key, channel] * np.sqrt(np.sqrt(square))
+            truth = rows.values[task, row, channel]
+            parts.append((task + first, row, channel, key, square, unit, last, truth))
+            first += len(rows.lengths)
+        return Cells(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def independent_tasks(ages: Array, span_s: float, gap_s: float) -> Array:
+    """(keys,) most independent tasks of each kind: spans of its length in the data.
+
+    Args:
+        ages: (keys,) s; infinite for values before the first observation.
+        span_s: s, length of the data.
+        gap_s: s, its typical gap.
+    """
+    lengths = np.where(np.isinf(ages), np.max(ages[np.isfinite(ages)], initial=gap_s), ages)
+    return np.asarray(np.maximum(span_s / np.maximum(lengths, gap_s), 1.0))
+
+
+class Stack(CausalBaseline):
+    """Causal baselines, averaged with weights on a simplex.
+
+    Attributes:
+        members: fitted baselines by name.
+        keys: kinds of values that have weights of their own.
+        weights: (keys, channels, members).
+        low: (channels,) lowest answer.
+        high: (channels,) highest answer.
+    """
+
+    flexible = True
+
+    members: dict[str, CausalBaseline]
+    keys: Keys
+    weights: Array
+    low: Array
+    high: Array
+
+    def start(self, like: Any) -> State:
+        """See `CausalBaseline`."""
+        state = {"keys": self.keys.start(like)}
+        return {**state, **{name: member.start(like) for name, member in self.members.items()}}
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        """See `CausalBaseline`."""
+        after = {"keys": self.keys.observe(state["keys"], time, values, mask)}
+        for name, member in self.members.items():
+            after[name] = member.observe(state[name], time, values, mask)
+        return after
+
+    def read(self, state: State, time: Any) -> Any:
+        """See `CausalBaseline`."""
+        xp = namespace(state["keys"]["count"])
+        key, _, _, last = xp.moveaxis(self.keys.read(state["keys"], time), -1, 0)
+        each = [member.read(state[name], time) for name, member in self.members.items()]
+        return self.mixed(each, key, last)
+
+    def mixed(self, each: Sequence[Any], key: Any, last: Any) -> Any:
+        """The weighted mean of predictions.
+
+        Args:
+            each: (..., channels) per member.
+            key: (..., channels) kinds.
+            last: (..., channels) last values: an answer may be as far out as they are.
+        """
+        xp = namespace(key)
+        channel = np.arange(len(self.mean)) if xp is np else xp.arange(len(self.mean))
+        weights = as_kind(self.weights, key)
+        at = key.astype(np.int64) if xp is np else key.long()
+        total = 0.0 * key
+        for j, predicted in enumerate(each):
+            total = total + weights[at, channel, j] * predicted
+        return self.bounded(total, last)
+
+    def bounded(self, value: Any, last: Any) -> Any:
+        """A value within the range of answers, or between it and the last value."""
+        xp = namespace(value)
+        low = xp.minimum(as_kind(self.low, value) + 0.0 * last, last)
+        high = xp.maximum(as_kind(self.high, value) + 0.0 * last, last)
+        return xp.minimum(xp.maximum(value, low), high)
+
+    def predict(self, dataset: Dataset) -> list[Array]:
+        """Predicts every row; see `Baseline.predict`."""
+        return self.mix([member.predict(dataset) for member in self.members.values()], dataset)
+
+    def mix(self, each: Sequence[Sequence[Array]], dataset: Dataset) -> list[Array]:
+        """The weighted mean of the members' predictions of a data set.
+
+        Args:
+            each: per member and trajectory (rows, channels).
+            dataset: that they predicted.
+        """
+        kinds = kinds_of(self.keys, dataset)
+        return [
+            self.mixed([p[i] for p in each], kind[..., 0], kind[..., 3])
+            for i, kind in enumerate(kinds)
+        ]
+
+    def arrays(self) -> dict[str, Array]:
+        """See `Baseline`."""
+        own = {
+            **super().arrays(),
+            "weights": self.weights,
+            "low": self.low,
+            "high": self.high,
+            "edges": self.keys.bins.edges,
+        }
+        nested = {f"local.{k}": v for k, v in self.keys.local.arrays().items()}
+        for name, member in self.members.items():
+            nested |= {f"member.{name}.{k}": v for k, v in member.arrays().items()}
+        return {**own, **nested}
+
+    def restore(self, arrays: Mapping[str, Array]) -> Stack:
+        """See `Baseline`."""
+        own = {k: v for k, v in arrays.items() if "." not in k}
+        edges = own.pop("edges")
+        super().restore(own)
+        self.keys = Keys(AgeBins(edges), LocalScale().restore(within(arrays, "local.")))
+        self.members = {}
+        for name in dict.fromkeys(k.split(".")[1] for k in arrays if k.startswith("member.")):
+            member = BASELINES[name]().restore(within(arrays, f"member.{name}."))
+            assert isinstance(member, CausalBaseline)
+            self.members[name] = member
+        return self
+
+
+def within(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
+    """The arrays whose names start with a prefix, without it."""
+    return {k[len(prefix) :]: v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def kinds_of(keys: Keys, dataset: Dataset) -> list[Array]:
+    """(rows, channels, 4) per trajectory, as `Keys.read`."""
+    return [
+        read[:length]
+        for rows in padded(dataset)
+        for read, length in zip(stepped(keys, rows), rows.lengths, strict=True)
+    ]
+
+
+def fit_stack(
+    members: Sequence[str],
+    train: Dataset,
+    validation: Dataset,
+    *,
+    span_s: float,
+    gap_s: float,
+) -> tuple[Stack, Cells, list[Array]]:
+    """Fits causal baselines to training tasks, and their weights to training and validation tasks.
+
+    Of a flexible baseline, the errors on training tasks are those of a fit to other tasks.
+
+    Args:
+        members: names of causal baselines.
+        train: tasks of the training data, from `draw_tasks`.
+        validation: tasks of other data.
+        span_s: s, length of the data that all tasks were drawn from.
+        gap_s: s, its typical gap.
+
+    Returns:
+        The stack, the values of the validation tasks, and the stack's predictions of these tasks
+        with weights fitted to the training tasks alone.
+    """
+    stack = Stack()
+    stack.mean, stack.scale = moments(train)
+    stack.low, stack.high = bounds(train)
+    stack.keys = Keys(AgeBins.of(train), LocalScale().fit(train))
+    stack.members = {}
+    predicted: list[list[Array]] = []
+    later: list[list[Array]] = []
+    for name in members:
+        member = fit_baseline(name, train)
+        assert isinstance(member, CausalBaseline)
+        stack.members[name] = member
+        predicted.append(cross_fitted(name, train) if member.flexible else member.predict(train))
+        later.append(member.predict(validation))
+    count = independent_tasks(stack.keys.ages(), span_s, gap_s)
+    cells = [stack.keys.cells(tasks) for tasks in (train, validation)]
+    errors = [errors_of(c, p, count) for c, p in zip(cells, (predicted, later), strict=True)]
+    stack.weights = simplex_weights(errors[0], train.channels)
+    held_out = stack.mix(later, validation)
+    stack.weights = simplex_weights(joined(errors), train.channels)
+    return stack, cells[1], held_out
+
+
+def cross_fitted(name: str, tasks: Dataset, folds: int = 3) -> list[Array]:
+    """Predictions of tasks by baselines that were fitted to others.
+
+    Args:
+        name: of a baseline.
+        tasks: from `draw_tasks`; those of one source trajectory are in one fold, and where there
+            are fewer sources than folds, those near each other in time.
+        folds: number of fits.
+    """
+    sources = tasks.meta.get("tasks") or [["", i, 0] for i in range(len(tasks))]
+    order = sorted(range(len(tasks)), key=lambda i: (sources[i][1], sources[i][2]))
+    many = len({s[1] for s in sources}) >= folds
+    fold = np.empty(len(tasks), dtype=np.int64)
+    if many:
+        ranks = {source: k % folds for k, source in enumerate(sorted({s[1] for s in sources}))}
+        fold[:] = [ranks[s[1]] for s in sources]
+    else:
+        fold[order] = np.arange(len(tasks)) * folds // len(tasks)
+    results: list[Array] = [np.empty(0)] * len(tasks)
+    for k in range(folds):
+        inside, outside = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
+        if not len(inside):
+            continue
+        kept = outside if len(outside) else inside
+        fitted = fit_baseline(name, take_tasks(tasks, kept))
+        for i, p in zip(inside.tolist(), fitted.predict(take_tasks(tasks, inside)), strict=True):
+            results[i] = p
+    return results
+
+
+def joined(errors: Sequence[Errors]) -> Errors:
+    """The errors of several sets of tasks."""
+    shift = np.cumsum([0, *(int(e.task.max(initial=-1)) + 1 for e in errors)])
+    return Errors(
+        np.concatenate([e.key for e in errors]),
+        np.concatenate([e.channel for e in errors]),
+        np.concatenate([e.task + s for e, s in zip(errors, shift, strict=False)]),
+        np.concatenate([e.truth for e in errors]),
+        np.concatenate([e.predictions for e in errors]),
+        errors[0].count,
+    )
+
+
+def bounds(dataset: Dataset) -> tuple[Array, Array]:
+    """(channels,) lowest and highest answer: the observed range, widened by `MARGIN` of it."""
+    low = np.min([np.where(t.observed, t.values, np.inf).min(axis=0) for t in dataset], axis=0)
+    high = np.max([np.where(t.observed, t.values, -np.inf).max(axis=0) for t in dataset], axis=0)
+    seen = np.isfinite(low)
+    margin = MARGIN * np.where(seen, high - low, 0.0)
+    return np.where(seen, low - margin, 0.0), np.where(seen, high + margin, 0.0)
+
+
+def errors_of(cells: Cells, predicted: Sequence[Sequence[Array]], count: Array) -> Errors:
+    """Errors of predictors, for `simplex_weights` and `gate`.
+
+    Args:
+        cells: values of tasks.
+        predicted: per predictor and trajectory (rows, channels).
+        count: (keys,) independent tasks.
+    """
+    return Errors(
+        cells.key,
+        cells.channel,
+        cells.task,
+        (cells.truth - cells.last) / cells.unit,
+        np.stack([cells.pick(p) for p in predicted], axis=1),
+        count,
+    )

@@ -1,0 +1,219 @@
+"""Weights of several predictors on a simplex, and how far a model may correct their mean.
+
+Both are fitted in closed form to errors on tasks, per channel and kind of value (a *key*: its time
+since observation, and how much the channel moves). Values of one task are correlated, so a task
+counts once per key, and all of them together count at most as often as independent spans of that
+length fit into the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+POOLED = 4.0
+"""Tasks of all channels together that count beside those of a channel."""
+
+WORST = 4.0
+"""Largest squared error in the pooled tasks, relative to that of the best predictor."""
+
+STILL = 1.0
+"""Tasks in which nothing moves that count beside the others."""
+
+CAUTION = 2.0
+"""Tasks in which a model has nothing to say that count beside the others."""
+
+OUTLIER = 20.0
+"""Errors of all predictors beyond this multiple of the usual one count less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Values of tasks with their predictions, one entry each.
+
+    Attributes:
+        key: kind of the value.
+        channel: its channel.
+        task: its task.
+        truth: the value, in units of `size` after subtracting `last`.
+        predictions: (values, predictors) the same of each prediction.
+        count: independent tasks per key, at most.
+    """
+
+    key: Integers
+    channel: Integers
+    task: Integers
+    truth: Array
+    predictions: Array
+    count: Array
+
+    @property
+    def keys(self) -> int:
+        """Number of kinds of values."""
+        return len(self.count)
+
+    def only(self, chosen: NDArray[np.bool_]) -> Errors:
+        """Some of the values."""
+        return Errors(
+            self.key[chosen],
+            self.channel[chosen],
+            self.task[chosen],
+            self.truth[chosen],
+            self.predictions[chosen],
+            self.count,
+        )
+
+
+def task_weights(errors: Errors, channels: int) -> tuple[Array, Array]:
+    """Weight of each value, so that the values of a task sum to one per key and channel.
+
+    Args:
+        errors: of all tasks.
+        channels: their number.
+
+    Returns:
+        (values,) weights, and (keys, channels) effective numbers of tasks.
+    """
+    tasks = int(errors.task.max(initial=0)) + 1
+    code = (errors.key * channels + errors.channel) * tasks + errors.task
+    _, place, many = np.unique(code, return_inverse=True, return_counts=True)
+    weight = 1.0 / many[place]
+    found = np.bincount(
+        errors.key * channels + errors.channel, weight, minlength=errors.keys * channels
+    ).reshape(errors.keys, channels)
+    effective = np.minimum(found, errors.count[:, None])
+    shrink = effective / np.maximum(found, 1e-300)
+    return weight * shrink[errors.key, errors.channel], effective
+
+
+def simplex_weights(errors: Errors, channels: int) -> Array:
+    """Weights of predictors, at least 0 and of sum 1, with the least squared error.
+
+    The Gram matrix of the errors of a key and channel gets `POOLED` tasks of all channels, and
+    `STILL` tasks whose truth is the last value (Wolpert, Stacked generalization, 1992; Breiman,
+    Stacked regressions, 1996).
+
+    Args:
+        errors: on tasks that the predictors were not fitted to.
+        channels: their number.
+
+    Returns:
+        (keys, channels, predictors).
+    """
+    predictors = errors.predictions.shape[1]
+    missed = errors.predictions - errors.truth[:, None]
+    weight, effective = task_weights(errors, channels)
+    weight = weight * _robust(missed)
+    place = errors.key * channels + errors.channel
+    size = errors.keys * channels
+    gram = np.empty((size, predictors, predictors))
+    still = np.empty_like(gram)
+    for j in range(predictors):
+        for k in range(j + 1):
+            for target, of in ((gram, missed), (still, errors.predictions)):
+                product = np.bincount(place, weight * of[:, j] * of[:, k], minlength=size)
+                target[:, j, k] = target[:, k, j] = product
+    shape = (errors.keys, channels, predictors, predictors)
+    many = np.maximum(effective, 1e-12)[..., None, None]
+    mean = gram.reshape(shape) / many
+    mean_still = still.reshape(shape) / many
+    # Channels are pooled relative to the error of their best predictor.
+    smallest = np.einsum("kcjj->kcj", mean).min(axis=2)
+    relative = 1.0 / np.maximum(smallest, 1e-12)[..., None, None]
+    seen = (effective > 0)[..., None, None]
+    own = np.where(seen, mean * relative, 0.0)
+    large = np.einsum("kcjj->kcj", own)
+    shrink = np.sqrt(np.minimum(1.0, WORST / np.maximum(large, 1e-12)))
+    shared = own * shrink[..., :, None] * shrink[..., None, :]
+    pooled = (effective[..., None, None] * shared).sum(axis=1)
+    total = effective.sum(axis=1)[:, None, None]
+    pooled = pooled / np.maximum(total, 1e-12)
+    weights = np.empty((errors.keys, channels, predictors))
+    for key in range(errors.keys):
+        prior = POOLED * min(1.0, float(total[key, 0, 0])) * pooled[key]
+        for c in range(channels):
+            rest = STILL * mean_still[key, c] * relative[key, c] if effective[key, c] else 0.0
+            weights[key, c] = on_simplex(effective[key, c] * own[key, c] + prior + rest)
+    return weights
+
+
+def on_simplex(gram: Array) -> Array:
+    """The weights w, at least 0 and of sum 1, with the least w' G w.
+
+    Args:
+        gram: (predictors, predictors) positive semi-definite.
+
+    Returns:
+        (predictors,).
+    """
+    size = len(gram)
+    largest = float(np.trace(gram)) / size
+    if not largest > 0:
+        return np.full(size, 1.0 / size)
+    values, vectors = np.linalg.eigh(gram / largest + 1e-9 * np.eye(size))
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    # A row of large weight asks for the sum.
+    system = np.vstack([root, np.full(size, 1e3)])
+    found, _ = nnls(system, np.append(np.zeros(size), 1e3), maxiter=50 * size)
+    return np.asarray(found / found.sum())
+
+
+def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
+    """How much of the difference of a model from the base improves it: gamma, from 0 to 1.
+
+    The least-squares factor of model - base, drawn to that of all channels of the key by `POOLED`
+    tasks, and to 0 by `CAUTION`.
+
+    Args:
+        errors: on tasks that neither the base nor the model was fitted to.
+        base: (values,) its predictions, as `Errors.predictions`.
+        model: (values,) those of the model.
+        channels: their number.
+
+    Returns:
+        (keys, channels); 0 where there is no value.
+    """
+    weight, effective = task_weights(errors, channels)
+    moved, left = model - base, errors.truth - base
+    weight = weight * _robust(left[:, None])
+    place = errors.key * channels + errors.channel
+    shape = (errors.keys, channels)
+
+    def summed(value: Array) -> Array:
+        found = np.bincount(place, weight * value, minlength=shape[0] * shape[1])
+        return np.asarray(found.reshape(shape), dtype=np.float64)
+
+    cross, square, least = summed(moved * left), summed(moved**2), summed(left**2)
+    many = np.maximum(effective, 1e-12)
+    relative = many / np.maximum(least, 1e-300)
+    pooled_square = (square * relative).sum(axis=1) + 1e-12
+    pooled = np.clip((cross * relative).sum(axis=1) / pooled_square, 0.0, 1.0)[:, None]
+    typical = square / many
+    top = cross + POOLED * pooled * typical
+    below = square + (POOLED + CAUTION) * typical
+    gamma = np.where(effective > 0, top / np.maximum(below, 1e-300), 0.0)
+    return np.asarray(np.clip(gamma, 0.0, 1.0))
+
+
+def _robust(missed: Array) -> Array:
+    """Weights below 1 for values that every predictor misses by far."""
+    weights: Array = np.minimum(1.0, OUTLIER / np.maximum(np.abs(missed).min(axis=1), 1e-12)) ** 2
+    return weights
+
+
+def ordered(names: Sequence[str], weights: Array) -> list[tuple[str, float]]:
+    """Names with their mean weight, the largest first.
+
+    Args:
+        names: of the predictors.
+        weights: (..., predictors).
+    """
+    mean = weights.reshape(-1, len(names)).mean(axis=0)
+    return sorted(zip(names, mean.tolist(), strict=True), key=lambda item: -item[1])

@@ -1,0 +1,214 @@
+"""The blend: weights with closed forms, intervals that cover, and answers that lose to nobody."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import offbeat as ob
+from offbeat.answers.blend import fit_blend, tables_of
+from offbeat.answers.both_sides import Sides
+from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
+from offbeat.baselines.history import AgeBins
+from offbeat.baselines.weights import Errors, gate, on_simplex, simplex_weights, task_weights
+from offbeat.data.masking import masked_values
+from offbeat.data.tasks import TaskConfig, draw_tasks
+
+
+def waves(seed: int, count: int = 8, rows: int = 200, noise: float = 0.02) -> ob.Dataset:
+    """Sines of two channels with noise, and a channel of noise alone, at uneven times."""
+    random = np.random.default_rng(seed)
+    made = []
+    for _ in range(count):
+        times = np.cumsum(random.uniform(0.008, 0.012, rows))
+        phase = random.uniform(0, 6)
+        values = np.stack(
+            [np.sin(6 * times + phase), 3 * np.cos(6 * times + phase), 0 * times], axis=1
+        )
+        values += random.normal(0, [noise, 3 * noise, 1.0], values.shape)
+        made.append(ob.Trajectory(times, values))
+    return ob.Dataset(tuple(made))
+
+
+def errors_from(truth, predictions, *, key=None, channel=None, count=1e9) -> Errors:
+    many = len(truth)
+    zeros = np.zeros(many, dtype=np.int64)
+    return Errors(
+        zeros if key is None else key,
+        zeros if channel is None else channel,
+        np.arange(many),
+        np.asarray(truth, dtype=float),
+        np.asarray(predictions, dtype=float),
+        np.array([count]),
+    )
+
+
+def test_independent_errors_are_weighted_by_their_inverse_variance():
+    weights = on_simplex(np.diag([1.0, 4.0, 4.0]))
+    assert weights == pytest.approx([4 / 6, 1 / 6, 1 / 6], abs=1e-6)
+
+
+def test_a_predictor_that_another_one_contains_gets_no_weight():
+    # errors e and e + f: the second adds noise only
+    assert on_simplex(np.array([[1.0, 1.0], [1.0, 3.0]])) == pytest.approx([1, 0], abs=1e-6)
+
+
+def test_a_task_counts_once_however_many_values_it_has():
+    zeros = np.zeros(5, dtype=np.int64)
+    errors = Errors(
+        zeros, zeros, np.array([0, 0, 0, 0, 1]), np.zeros(5), np.zeros((5, 1)), np.array([9.0])
+    )
+    weight, effective = task_weights(errors, 1)
+    assert weight.tolist() == [0.25] * 4 + [1.0]
+    assert effective.tolist() == [[2.0]]
+
+
+def test_no_more_tasks_count_than_fit_into_the_data():
+    errors = errors_from(np.zeros(100), np.zeros((100, 1)), count=5.0)
+    weight, effective = task_weights(errors, 1)
+    assert effective.tolist() == [[5.0]]
+    assert weight.sum() == pytest.approx(5.0)
+
+
+def test_weights_of_many_tasks_are_those_of_least_squares():
+    random = np.random.default_rng(0)
+    truth = random.normal(0, 3, 20000)
+    predictions = np.stack(
+        [truth + random.normal(0, 1, 20000), truth + random.normal(0, 2, 20000)], axis=1
+    )
+    weights = simplex_weights(errors_from(truth, predictions), 1)
+    assert weights[0, 0] == pytest.approx([0.8, 0.2], abs=0.02)
+
+
+def test_gamma_is_the_least_squares_factor():
+    random = np.random.default_rng(0)
+    base, said = np.zeros(20000), random.normal(0, 1, 20000)
+    truth = 0.4 * said + random.normal(0, 0.1, 20000)
+    errors = errors_from(truth, base[:, None])
+    assert gate(errors, base, said, 1)[0, 0] == pytest.approx(0.4, abs=0.01)
+    assert gate(errors, base, -said, 1)[0, 0] == 0
+    few = errors_from(truth[:3], base[:3, None])
+    assert gate(few, base[:3], said[:3], 1)[0, 0] < 0.4
+
+
+def test_half_widths_are_quantiles_of_absolute_errors():
+    random = np.random.default_rng(0)
+    truth = random.normal(0, 1, 50000)
+    widths = fit_half_widths(errors_from(truth, np.zeros((50000, 1))), np.zeros(50000), 1)
+    # quantiles of the half-normal distribution
+    assert half_width(widths.table[0, 0], 0.5) == pytest.approx(0.6745, abs=0.02)
+    assert half_width(widths.table[0, 0], 0.9) == pytest.approx(1.6449, abs=0.03)
+    assert half_width(widths.table[0, 0], 0.95) == pytest.approx(1.96, abs=0.03)
+
+
+def test_with_few_values_the_intervals_are_wider():
+    truth = np.linspace(-1, 1, 9)
+    few = fit_half_widths(errors_from(truth, np.zeros((9, 1)), count=9.0), np.zeros(9), 1)
+    assert half_width(few.table[0, 0], 0.9) == pytest.approx(1.0)
+
+
+def test_crps_of_a_gaussian_is_its_closed_form():
+    # quantiles of N(0, 1); CRPS(y) = y (2 Phi(y) - 1) + 2 phi(y) - 1 / sqrt(pi)
+    from scipy.stats import norm
+
+    widths = norm.ppf((1 + LEVELS) / 2)
+    for y in (0.0, 0.3, -1.2, 2.5):
+        exact = y * (2 * norm.cdf(y) - 1) + 2 * norm.pdf(y) - 1 / math.sqrt(math.pi)
+        assert crps(widths, np.array(y)) == pytest.approx(exact, rel=0.03)
+
+
+def test_models_that_continue_straight_are_joined_to_the_cubic_hermite_interpolation():
+    times = np.array([0.0, 0.3, 0.5, 1.1, 1.9, 2.0])
+    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.7, 3.0])
+    seen = np.array([True, False, False, False, False, True])
+    t = ob.Trajectory(times, cubic(times)[:, None], observed=seen[:, None])
+    slope = cubic.deriv()
+    forward = cubic(0.0) + slope(0.0) * times
+    backward = cubic(2.0) + slope(2.0) * (times - 2.0)
+    joined = Sides.of(t).joined(t.values, forward[:, None], backward[:, None])
+    assert joined[1:5, 0] == pytest.approx(cubic(times[1:5]))
+
+
+@pytest.fixture(scope="module")
+def blend():
+    config = TaskConfig(horizon_s=0.3, gap_s=0.01)
+    return fit_blend(waves(0), waves(1, 4), tasks=config)
+
+
+def test_answers_lose_to_no_baseline(blend):
+    test = draw_tasks(waves(2, 10), blend.tasks, 300, seed=5)
+    answers = [a.values for a in blend.causal(test)]
+    each = {name: m.predict(test) for name, m in blend.stack.members.items()}
+    for channel in range(3):
+        rmse = {}
+        for name, predicted in {**each, "blend": answers}.items():
+            missed = [
+                (p - t.values)[masked_values(t)[:, channel], channel]
+                for p, t in zip(predicted, test, strict=True)
+            ]
+            rmse[name] = np.sqrt(np.mean(np.concatenate(missed) ** 2))
+        assert rmse["blend"] <= 1.02 * min(rmse.values())
+
+
+@pytest.mark.parametrize("level", [0.5, 0.8, 0.95])
+def test_intervals_cover(blend, level):
+    test = draw_tasks(waves(2, 20), blend.tasks, 400, seed=5)
+    inside = []
+    for answer, t in zip(blend.causal(test), test, strict=True):
+        low, high = answer.interval(level)
+        inside.append(((low <= t.values) & (t.values <= high))[masked_values(t)])
+    assert np.concatenate(inside).mean() == pytest.approx(level, abs=0.04)
+
+
+def test_intervals_grow_with_the_time_since_observation(blend):
+    t = waves(3, 1)[0]
+    observed = np.ones_like(t.observed)
+    observed[100:] = False
+    answer = blend.causal(ob.Dataset((ob.Trajectory(t.times, t.values, observed=observed),)))[0]
+    half = answer.half_width(0.9)[:, 0]
+    assert half[125] > 2 * half[100]
+
+
+def test_asked_times_change_no_other_answer(blend):
+    t = waves(3, 1)[0]
+    observed = np.ones_like(t.observed)
+    observed[100:] = False
+    whole = ob.Trajectory(t.times, t.values, observed=observed)
+    last = ob.Trajectory(
+        np.append(t.times[:100], t.times[150]),
+        np.vstack([t.values[:100], t.values[150:151]]),
+        observed=np.vstack([observed[:100], observed[150:151]]),
+    )
+    many = blend.causal(ob.Dataset((whole,)))[0].values
+    one = blend.causal(ob.Dataset((last,)))[0].values
+    assert np.array_equal(one[-1], many[150])
+
+
+def test_what_is_saved_answers_the_same(blend):
+    from dataclasses import replace
+
+    again = replace(blend, **tables_of(blend.arrays()))
+    test = draw_tasks(waves(2, 4), blend.tasks, 20, seed=5)
+    for ask in ("causal", "fill"):
+        for a, b in zip(getattr(blend, ask)(test), getattr(again, ask)(test), strict=True):
+            assert np.array_equal(a.values, b.values)
+            assert np.array_equal(a.half_width(), b.half_width())
+
+
+def test_answers_stay_in_the_range_of_training_and_say_where_they_are_beyond(blend):
+    t = waves(3, 1)[0]
+    observed = np.ones_like(t.observed)
+    observed[60:] = False
+    late = ob.Trajectory(
+        np.where(np.arange(200) < 60, t.times, t.times + 100.0), t.values, observed=observed
+    )
+    answer = blend.causal(ob.Dataset((late,)))[0]
+    assert answer.beyond[60:].all()
+    assert not answer.beyond[10:60, 0].any()
+    assert np.abs(answer.values[:, 0]).max() < 2.2
+
+
+def test_bins_of_lengths_end_at_the_longest():
+    assert AgeBins.of_lengths(0.01, 0.1).edges.tolist() == pytest.approx([0.015, 0.03, 0.06, 0.12])
