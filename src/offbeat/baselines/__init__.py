@@ -17,6 +17,7 @@ from offbeat.baselines.base import (
     fit_baseline,
 )
 from offbeat.baselines.history import AgeBins, History
+from offbeat.baselines.kalman_fit import ChannelKalman, ChannelKalmanLong, ChannelSmoother
 from offbeat.baselines.simple import (
     ConstantVelocity,
     DampedSlope,
@@ -33,6 +34,9 @@ __all__ = [
     "AgeBins",
     "Baseline",
     "CausalBaseline",
+    "ChannelKalman",
+    "ChannelKalmanLong",
+    "ChannelSmoother",
     "ConstantVelocity",
     "DampedSlope",
     "History",

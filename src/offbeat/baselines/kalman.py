@@ -1,0 +1,421 @@
+"""Kalman filters and smoothers over chains: a position and its derivatives, at uneven times.
+
+The last state of a chain is an Ornstein-Uhlenbeck process, damped velocity or damped acceleration;
+the states before it are its integrals, and the position also has a random walk:
+
+    dx = v dt + sqrt(walk) dB,    dv = -damping v dt + sqrt(drive) dW        (order 2)
+    dx = v dt + sqrt(walk) dB,    dv = a dt,    da = -damping a dt + sqrt(drive) dW    (order 3)
+
+Each state may be measured, with white noise. Without damping, order 2 is white acceleration and
+order 3 white jerk; with damping, order 3 is the model of Singer (1970), IEEE Trans. AES 6(4).
+Discretisation is exact for any gap, and all arithmetic is over arrays of chains: there are no small
+matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.baselines.base import Array, Rows, State, namespace
+from offbeat.baselines.simple import as_kind
+
+SERIES_BELOW = 0.3
+"""Damping times gap up to which a power series is used: closed forms cancel there."""
+
+_TERMS = 14
+
+
+def _series(p: int, q: int) -> list[float]:
+    """Coefficients in z of the integral of u^(p+q) phi_p(-z u) phi_q(-z u) over u from 0 to 1."""
+    phi = [[(-1.0) ** m / math.factorial(m + r) for m in range(_TERMS)] for r in (p, q)]
+    product = np.convolve(phi[0], phi[1])[:_TERMS]
+    return [float(c) / (m + p + q + 1) for m, c in enumerate(product)]
+
+
+_INTEGRALS = {(p, q): _series(p, q) for p in range(3) for q in range(p, 3)}
+_PHI_2 = [(-1.0) ** m / math.factorial(m + 2) for m in range(_TERMS)]
+
+
+class Transition(NamedTuple):
+    """What happens to chains over a gap.
+
+    Attributes:
+        matrix: of order rows and columns; None stands for 0 below the diagonal and for 1 on it.
+        noise: covariance that is added, per pair i <= j of states.
+    """
+
+    matrix: list[list[Any]]
+    noise: dict[tuple[int, int], Any]
+
+
+def transition(gap: Any, damping: Any, drive: Any, walk: Any, order: int) -> Transition:
+    """The exact transition of chains; two of them in a row are one over the sum of the gaps.
+
+    With E_0 = exp(-z), E_1 = 1 - E_0, E_2 = z - E_1 and z = damping * gap, the last state moves
+    the p-th state before it by gap^p E_p / z^p, and the covariance of two states is drive times
+    the integral of the product of those.
+
+    Args:
+        gap: (...) at least 0.
+        damping: (...) at least 0, per unit of the gap.
+        drive: (...) variance of the noise on the last state, per unit of the gap.
+        walk: (...) the same on the position.
+        order: number of states, 2 or 3.
+    """
+    xp = namespace(gap)
+    z = gap * damping
+    small = z < SERIES_BELOW
+    safe = xp.where(small, 1.0, z)
+    e0, e1 = xp.exp(-z), -xp.expm1(-z)
+    e2 = xp.where(small, z * z * _polynomial(_PHI_2, z), z - e1)
+    # phi_p = E_p / z^p
+    phi_1 = xp.where(small, 1.0 - z * _polynomial(_PHI_2, z), e1 / safe)
+    reach = [e0, gap * phi_1]
+    half = 0.5 * (1.0 - e0 * e0)
+    exact = {
+        (0, 0): half,
+        (0, 1): 0.5 * e1 * e1,
+        (1, 1): z - 2.0 * e1 + half,
+    }
+    if order == 3:
+        reach.append(gap * gap * xp.where(small, _polynomial(_PHI_2, z), e2 / (safe * safe)))
+        exact[0, 2] = half - z * e0
+        exact[1, 2] = 0.5 * e2 * e2
+        exact[2, 2] = ((z - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * z * e0 + half
+    matrix: list[list[Any]] = [[None] * order for _ in range(order)]
+    noise: dict[tuple[int, int], Any] = {}
+    last = order - 1
+    for i in range(order):
+        matrix[i][last] = reach[last - i]
+        for j in range(i + 1, last):
+            matrix[i][j] = gap ** (j - i) / math.factorial(j - i)
+        for j in range(i, order):
+            q, p = last - i, last - j
+            power = p + q + 1
+            scaled = xp.where(small, _polynomial(_INTEGRALS[p, q], z), exact[p, q] / safe**power)
+            noise[i, j] = drive * gap**power * scaled
+    noise[0, 0] = noise[0, 0] + walk * gap
+    return Transition(matrix, noise)
+
+
+def _polynomial(coefficients: list[float], z: Any) -> Any:
+    result = coefficients[-1] + 0.0 * z
+    for c in reversed(coefficients[:-1]):
+        result = result * z + c
+    return result
+
+
+class Belief(NamedTuple):
+    """Mean and covariance of the states of chains.
+
+    Attributes:
+        mean: (..., chains) per state.
+        cov: (..., chains) per pair i <= j of states.
+    """
+
+    mean: list[Any]
+    cov: dict[tuple[int, int], Any]
+
+    def moved(self, step: Transition) -> Belief:
+        """After a gap."""
+        order, f = len(self.mean), step.matrix
+        mean = [_row(f[i], i, self.mean) for i in range(order)]
+        columns = [[self.cov[min(i, j), max(i, j)] for i in range(order)] for j in range(order)]
+        half = [[_row(f[i], i, columns[j]) for j in range(order)] for i in range(order)]
+        cov = {(i, j): _row(f[j], j, half[i]) + step.noise[i, j] for i, j in step.noise}
+        return Belief(mean, cov)
+
+    def updated(self, j: int, value: Any, noise: Any, mask: Any) -> tuple[Belief, Update]:
+        """After a measurement of state j; exact and symmetric for noise of any size, 0 included.
+
+        Args:
+            j: number of the state.
+            value: (..., chains) measured.
+            noise: (..., chains) its variance.
+            mask: (..., chains) bool, where there is a measurement.
+        """
+        xp = namespace(value)
+        order = len(self.mean)
+        column = [self.cov[min(i, j), max(i, j)] for i in range(order)]
+        total = column[j] + noise
+        total = xp.where(mask & (total > 0), total, 1.0)
+        gain = [xp.where(mask, c / total, 0.0) for c in column]
+        surprise = xp.where(mask, value - self.mean[j], 0.0)
+        kept = xp.where(mask, noise / total, 1.0)
+        mean = [m + g * surprise for m, g in zip(self.mean, gain, strict=True)]
+        cov = {}
+        for (a, b), p in self.cov.items():
+            if j in (a, b):
+                cov[a, b] = p * kept
+            else:
+                left = p - gain[a] * column[b]
+                cov[a, b] = xp.where(left > 0, left, 0.0) if a == b else left
+        return Belief(mean, cov), Update(j, gain, surprise / total, mask)
+
+
+class Update(NamedTuple):
+    """A measurement, as the smoother needs it: state, gain, innovation by its variance, mask."""
+
+    state: int
+    gain: list[Any]
+    surprise: Any
+    mask: Any
+
+
+def _row(row: list[Any], i: int, vector: list[Any]) -> Any:
+    """A row of a transition matrix times a vector."""
+    result = vector[i] if row[i] is None else row[i] * vector[i]
+    for j in range(i + 1, len(vector)):
+        result = result + row[j] * vector[j]
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Chains:
+    """Chains of one order and their parameters.
+
+    States have the unit `unit`, time has the unit `clock`; variances are in multiples of
+    `variance`, on which no mean depends. Parameters may have further axes before the last, of
+    candidates in a search; then so do states.
+
+    Attributes:
+        channels: (chains, order) number of the channel that measures a state; -1 where none does.
+        offset: (chains,) zero of the position, in its unit.
+        unit: (chains, order) size of one unit of a state in the channel that measures it.
+        clock: (chains,) s.
+        longest: (chains,) s, longest time after the last observation for which the mean moves on.
+        drive: (chains,) see `transition`.
+        walk: (chains,) see `transition`.
+        damping: (chains,) see `transition`.
+        noise: (order, chains) variance of the measurements of a state.
+        prior_mean: (order, chains) of the states before the first observation.
+        prior: (order, chains) their variance.
+        variance: (chains,) unit of the variances.
+    """
+
+    channels: NDArray[np.int64]
+    offset: Array
+    unit: Array
+    clock: Array
+    longest: Array
+    drive: Array
+    walk: Array
+    damping: Array
+    noise: Array
+    prior_mean: Array
+    prior: Array
+    variance: Array = field(default_factory=lambda: np.ones(1))
+
+    @property
+    def order(self) -> int:
+        """Number of states of a chain."""
+        return int(self.channels.shape[1])
+
+    def arrays(self, prefix: str) -> dict[str, Array]:
+        """All fields by name, after a prefix; `of` is the inverse."""
+        return {prefix + name: getattr(self, name) for name in self.__dataclass_fields__}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Array], prefix: str) -> Chains:
+        """From what `arrays` returned."""
+        fields: dict[str, Any] = {
+            n: np.asarray(arrays[prefix + n]) for n in cls.__dataclass_fields__
+        }
+        return cls(**fields)
+
+    # --- filter -----------------------------------------------------------------------------------
+
+    def start(self, like: Any) -> State:
+        """The state before the first row; see `CausalBaseline.start`."""
+        empty = like[..., self._of(0)] * 0.0
+        seen = {f"seen{i}": empty for i in range(self.order)}
+        return {**self._packed(self._before(empty)), "time": empty, "started": empty, **seen}
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        """The state after a row; see `CausalBaseline.observe`."""
+        return self.committed(state, self.moved(state, time), time, values, mask)
+
+    def read(self, state: State, time: Any) -> list[Any]:
+        """(..., chains) per state: the mean, in units of the channels."""
+        xp = namespace(state["time"])
+        longest = state["time"] + self._like(self.longest, state["time"])
+        belief = self.moved(state, xp.where(time < longest, time, longest))
+        return self.in_units(belief.mean, [state[f"seen{i}"] for i in range(self.order)])
+
+    def read_variance(self, state: State, time: Any) -> list[Any]:
+        """(..., chains) per state: variance of a measurement, in squared units of the channels."""
+        cov = self.moved(state, time).cov
+        like = state["time"]
+        return [
+            (cov[i, i] + self._like(self.noise[i], like))
+            * self._like(self.variance * self.unit[:, i] ** 2, like)
+            for i in range(self.order)
+        ]
+
+    def moved(self, state: State, time: Any) -> Belief:
+        """The belief at a time after the last observation; before the first one, the prior."""
+        xp = namespace(state["time"])
+        belief = self._unpacked(state)
+        gap = xp.where(state["started"] > 0, time - state["time"], 0.0)
+        return belief.moved(self._transition(gap))
+
+    def committed(self, state: State, moved: Belief, time: Any, values: Any, mask: Any) -> State:
+        """The state after a row, given the belief before it."""
+        xp = namespace(state["time"])
+        masks = self._masks(mask)
+        some = masks[0]
+        for each in masks[1:]:
+            some = some | each
+        belief, _ = self._measured(moved, values, masks)
+        new = {
+            name: xp.where(some, value, state[name]) for name, value in self._packed(belief).items()
+        }
+        new["time"] = xp.where(some, time + 0.0 * state["time"], state["time"])
+        new["started"] = xp.where(some, 1.0, state["started"])
+        for i, each in enumerate(masks):
+            new[f"seen{i}"] = xp.where(each, 1.0, state[f"seen{i}"])
+        return new
+
+    # --- smoother ---------------------------------------------------------------------------------
+
+    def smooth(self, rows: Rows) -> list[Array]:
+        """The mean of every row given all observations: the Rauch-Tung-Striebel smoother.
+
+        In the form of Bryson and Frazier (1963), which inverts no covariance, so that noise and
+        gaps may be as small as they like.
+
+        Args:
+            rows: of equal channels; `values` and `observed` are used.
+
+        Returns:
+            (..., batch, rows, chains) per state, in units of the channels.
+        """
+        count = rows.times.shape[1]
+        gaps = np.diff(rows.times, axis=1, prepend=rows.times[:, :1])
+        empty = np.zeros((len(rows.times), len(self.channels)))
+        belief = self._before(empty)
+        steps: list[Transition] = []
+        before: list[Belief] = []
+        updates: list[list[Update]] = []
+        for i in range(count):
+            steps.append(self._transition(gaps[:, i, None] + empty))
+            before.append(belief.moved(steps[-1]))
+            masks = self._masks(rows.observed[:, i])
+            belief, made = self._measured(before[-1], rows.values[:, i], masks)
+            updates.append(made)
+        adjoint: list[Any] = [0.0 * empty] * self.order
+        means: list[list[Array]] = []
+        for i in range(count - 1, -1, -1):
+            for update in reversed(updates[i]):
+                j = update.state
+                fed = sum(g * a for g, a in zip(update.gain, adjoint, strict=True))
+                adjoint[j] = adjoint[j] - np.where(update.mask, fed + update.surprise, 0.0)
+            cov = before[i].cov
+            means.append(
+                [
+                    m - sum(cov[min(a, b), max(a, b)] * adjoint[b] for b in range(self.order))
+                    for a, m in enumerate(before[i].mean)
+                ]
+            )
+            adjoint = _transposed(steps[i].matrix, adjoint)
+        stacked = [np.stack([m[a] for m in reversed(means)], axis=-2) for a in range(self.order)]
+        seen = [m.any(axis=1)[:, None] * 1.0 for m in self._masks(rows.observed)]
+        return self.in_units(stacked, seen)
+
+    # --- what both share --------------------------------------------------------------------------
+
+    def in_units(self, mean: list[Any], seen: list[Any]) -> list[Any]:
+        """States in units of their channels.
+
+        A position that was not observed yet is its mean: its derivatives do not tell where it is.
+
+        Args:
+            mean: (..., chains) per state.
+            seen: (..., chains) per state, whether its channel was observed.
+        """
+        xp = namespace(mean[0])
+        units = [m * self._like(self.unit[:, i], m) for i, m in enumerate(mean)]
+        offset = self._like(self.offset, mean[0])
+        return [xp.where(seen[0] > 0, units[0], 0.0) + offset, *units[1:]]
+
+    def _before(self, empty: Any) -> Belief:
+        mean = [empty + self._like(m, empty) for m in self.prior_mean]
+        cov = {(i, j): empty for i in range(self.order) for j in range(i, self.order)}
+        for i in range(self.order):
+            cov[i, i] = empty + self._like(self.prior[i], empty)
+        return Belief(mean, cov)
+
+    def _transition(self, gap: Any) -> Transition:
+        gap = gap / self._like(self.clock, gap)
+        damping, drive, walk = (self._like(a, gap) for a in (self.damping, self.drive, self.walk))
+        return transition(gap, damping, drive, walk, self.order)
+
+    def _measured(
+        self, belief: Belief, values: Any, masks: list[Any]
+    ) -> tuple[Belief, list[Update]]:
+        updates = []
+        for i, mask in enumerate(masks):
+            if not (self.channels[:, i] >= 0).any():
+                continue
+            value = values[..., self._of(i)]
+            if i == 0:
+                value = value - self._like(self.offset, value)
+            value = value / self._like(self.unit[:, i], value)
+            belief, update = belief.updated(i, value, self._like(self.noise[i], value), mask)
+            updates.append(update)
+        return belief, updates
+
+    def _masks(self, mask: Any) -> list[Any]:
+        xp = namespace(mask)
+        there = xp.asarray(self.channels >= 0)
+        if xp is not np:
+            there = there.to(mask.device)
+        return [mask[..., self._of(i)] & there[:, i] for i in range(self.order)]
+
+    def _of(self, i: int) -> NDArray[np.int64]:
+        """(chains,) channel of a state; any where there is none."""
+        return np.maximum(self.channels[:, i], 0)
+
+    def _like(self, array: Array, like: Any) -> Any:
+        return as_kind(array, like)
+
+    def _packed(self, belief: Belief) -> State:
+        means = {f"mean{i}": m for i, m in enumerate(belief.mean)}
+        return means | {f"cov{i}{j}": p for (i, j), p in belief.cov.items()}
+
+    def _unpacked(self, state: State) -> Belief:
+        order = range(self.order)
+        return Belief(
+            [state[f"mean{i}"] for i in order],
+            {(i, j): state[f"cov{i}{j}"] for i in order for j in order if i <= j},
+        )
+
+
+def filtered(chains: Chains, rows: Rows) -> list[Array]:
+    """What a filter predicts for every row: (candidates, batch, rows, chains) per state."""
+    state = chains.start(np.zeros((rows.values.shape[0], rows.values.shape[2])))
+    reads = []
+    for i in range(rows.values.shape[1]):
+        time = rows.times[:, i, None]
+        moved = chains.moved(state, time)
+        seen = [state[f"seen{j}"] for j in range(chains.order)]
+        reads.append(chains.in_units(moved.mean, seen))
+        state = chains.committed(state, moved, time, rows.values[:, i], rows.observed[:, i])
+    return [np.stack([r[j] for r in reads], axis=-2) for j in range(chains.order)]
+
+
+def _transposed(matrix: list[list[Any]], vector: list[Any]) -> list[Any]:
+    """The transpose of a transition matrix times a vector."""
+    result = []
+    for j in range(len(vector)):
+        own = vector[j] if matrix[j][j] is None else matrix[j][j] * vector[j]
+        for i in range(j):
+            own = own + matrix[i][j] * vector[i]
+        result.append(own)
+    return result
