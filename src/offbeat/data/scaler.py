@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.arrays import frozen
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import EXOGENOUS, STATE, Dataset
 from offbeat.errors import InputError, one_of
 
 ScalerKind = Literal["standardise", "robust", "min_max", "divide_by_max", "identity"]
@@ -65,13 +65,15 @@ class Scaler:
             dataset: the training part.
 
         Raises:
-            InputError: a channel is never observed, or its maximum is 0 under `divide_by_max`.
+            InputError: a channel that is not exogenous is never observed, or its maximum is 0 under
+                `divide_by_max`.
         """
         one_of("scaler", kind, SCALERS)
         count, mean, square, low, high = moments(dataset)
-        check_observed(dataset.names, count, len(dataset))
+        check_observed(dataset.names, count, len(dataset), roles=dataset.roles)
         if kind == "identity":
             return cls.identity(dataset.channels)
+        low, high = np.where(count, low, 0.0), np.where(count, high, 1.0)  # without a value
         if kind == "standardise":
             deviation = np.sqrt(square)
             # The scale of a constant channel stays 1.
@@ -79,6 +81,8 @@ class Scaler:
         if kind == "robust":
             columns = [
                 np.concatenate([t.values[t.observed[:, c], c] for t in dataset])
+                if count[c]
+                else np.zeros(1)
                 for c in range(dataset.channels)
             ]
             deviation = np.array([clipped(column).std() for column in columns])
@@ -134,14 +138,31 @@ def clipped(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.clip(values, low, high)
 
 
-def check_observed(names: Sequence[str], count: NDArray[np.int64], trajectories: int) -> None:
-    """Checks that each channel has an observed value.
+def check_observed(
+    names: Sequence[str],
+    count: NDArray[np.int64],
+    trajectories: int,
+    *,
+    roles: Sequence[str] | None = None,
+) -> None:
+    """Checks that each channel that is to be predicted has an observed value.
+
+    Args:
+        names: of the channels.
+        count: (channels,) observed values.
+        trajectories: number of them, for the message.
+        roles: of the channels; exogenous ones may have no value. None: all are states.
 
     Raises:
         InputError: a channel has none; the message names all of them.
     """
-    if (count == 0).any():
-        never = [name for name, n in zip(names, count, strict=True) if n == 0]
+    roles = roles or [STATE] * len(names)
+    never = [
+        name
+        for name, n, role in zip(names, count, roles, strict=True)
+        if n == 0 and role != EXOGENOUS
+    ]
+    if never:
         raise InputError(
             f"never observed in {trajectories} training trajectories: {', '.join(never)}; leave "
             "such channels out, nothing can be learned about them"

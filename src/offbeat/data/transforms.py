@@ -1,8 +1,9 @@
-"""Input transforms: angles without wraps, quaternions without sign flips, for batches and streams.
+"""Input transforms: angles without wraps, quaternions without sign flips, channels left out.
 
-A model is trained on unwrapped angles and on quaternions that are continuous in
-sign. `Transforms` records these channels; it is saved with the model, applied to
-all inputs of the model, and undone on its predictions.
+A model is trained on unwrapped angles and on quaternions that are continuous in sign, without
+the marks of missing values, and without channels that it can learn nothing from. `Transforms`
+records these channels; it is saved with the model, applied to all inputs of the model, and
+undone on its predictions.
 """
 
 from __future__ import annotations
@@ -86,11 +87,18 @@ class Transforms:
 
     Each angle is unwrapped: a step of more than half a turn between two observations is treated as
     a wrap. Each quaternion is scaled to length 1, with the sign nearer to the observation before.
-    The result depends only on earlier observations, so a stream and a batch agree.
+    The result depends only on earlier observations, so a stream and a batch agree. Values that mark
+    missing ones are not observed. Channels that are constant, a copy of another one, or ignored are
+    not given to the model; its predictions have the constant, the prediction of the other one, or
+    none (NaN).
 
     Attributes:
         angles: the angle channels, by name.
         quaternions: four channel names per quaternion.
+        missing: by channel, the values that mark a missing one, such as -999.
+        constants: by channel, the value that it always has.
+        copies: by channel, the one that it is a copy of.
+        ignored: channels that are not given to the model and not predicted, such as counters.
 
     Raises:
         InputError: a quaternion does not have four channels, or a channel is named twice.
@@ -98,11 +106,20 @@ class Transforms:
 
     angles: Mapping[str, Angle] = field(default_factory=dict)
     quaternions: tuple[tuple[str, ...], ...] = ()
+    missing: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    copies: Mapping[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "angles", dict(self.angles))
         fours = tuple(tuple(four) for four in self.quaternions)
         object.__setattr__(self, "quaternions", fours)
+        missing = {name: tuple(values) for name, values in self.missing.items()}
+        object.__setattr__(self, "missing", missing)
+        object.__setattr__(self, "constants", dict(self.constants))
+        object.__setattr__(self, "copies", dict(self.copies))
+        object.__setattr__(self, "ignored", tuple(self.ignored))
         for four in fours:
             if len(four) != 4:
                 raise InputError(f"a quaternion has four channels, got {list(four)}")
@@ -110,6 +127,14 @@ class Transforms:
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f"the channel {twice!r} is named twice in the transforms")
+        for name, source in self.copies.items():
+            if source in self.left_out:
+                raise InputError(f"{name!r} is a copy of {source!r}, which is left out itself")
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The channels that are not given to the model."""
+        return (*self.constants, *self.copies, *self.ignored)
 
     @classmethod
     def identity(cls) -> Transforms:
@@ -131,28 +156,41 @@ class Transforms:
                 if name in units
             } | turns.get("channels", {})
             found = cls.from_dict({"angles": angles, "quaternions": fours.get("channels", [])})
-        return found.restricted(dataset.names)
+        return replace(
+            found, missing=_merged(found.missing, masked_marks(dataset.meta))
+        ).restricted(dataset.names)
 
     @property
     def is_identity(self) -> bool:
         """Whether the transforms change nothing."""
-        return not self.angles and not self.quaternions
+        return not (self.angles or self.quaternions or self.missing or self.left_out)
 
     def restricted(self, names: Sequence[str]) -> Transforms:
         """The transforms of these channels only."""
         return Transforms(
             {name: angle for name, angle in self.angles.items() if name in names},
             tuple(four for four in self.quaternions if set(four) <= set(names)),
+            {name: values for name, values in self.missing.items() if name in names},
+            {name: value for name, value in self.constants.items() if name in names},
+            {name: of for name, of in self.copies.items() if {name, of} <= set(names)},
+            tuple(name for name in self.ignored if name in names),
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-like form."""
+        """JSON-like form; kinds of transforms that there are none of are left out."""
+        rest: dict[str, Any] = {
+            "missing": {name: list(values) for name, values in self.missing.items()},
+            "constants": dict(self.constants),
+            "copies": dict(self.copies),
+            "ignored": list(self.ignored),
+        }
         return {
             "angles": {
                 name: {"period": angle.period, "lowest": angle.lowest}
                 for name, angle in self.angles.items()
             },
             "quaternions": [list(four) for four in self.quaternions],
+            **{kind: found for kind, found in rest.items() if found},
         }
 
     @classmethod
@@ -164,8 +202,16 @@ class Transforms:
         """
         try:
             angles = {str(name): Angle(**angle) for name, angle in value["angles"].items()}
-            return cls(angles, tuple(tuple(map(str, four)) for four in value["quaternions"]))
-        except (AttributeError, KeyError, TypeError) as error:
+            missing = value.get("missing", {})
+            return cls(
+                angles,
+                tuple(tuple(map(str, four)) for four in value["quaternions"]),
+                {str(name): tuple(map(float, marks)) for name, marks in missing.items()},
+                {str(name): float(one) for name, one in value.get("constants", {}).items()},
+                {str(name): str(of) for name, of in value.get("copies", {}).items()},
+                tuple(map(str, value.get("ignored", ()))),
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"the transforms are damaged ({type(error).__name__}: {error})"
             ) from None
@@ -187,7 +233,14 @@ class Transforms:
         todo = self._without(done).restricted(dataset.names)
         if todo.is_identity:
             return dataset
-        both = Transforms({**done.angles, **todo.angles}, (*done.quaternions, *todo.quaternions))
+        both = Transforms(
+            {**done.angles, **todo.angles},
+            (*done.quaternions, *todo.quaternions),
+            _merged(done.missing, todo.missing),
+            {**done.constants, **todo.constants},
+            {**done.copies, **todo.copies},
+            (*done.ignored, *todo.ignored),
+        )
         return replace(
             dataset,
             trajectories=tuple(_transformed(t, todo) for t in dataset),
@@ -199,7 +252,7 @@ class Transforms:
 
         Angles get the turns of the last observation before them, and are within the range
         of the sensor if all observations before them were. Quaternions have
-        length 1.
+        length 1. Constants and copies get their values.
 
         Args:
             predicted: one trajectory of predictions per trajectory given.
@@ -217,6 +270,10 @@ class Transforms:
             for four in self.quaternions:
                 columns = [answer.names.index(name) for name in four]
                 values[:, columns] = unit_quaternions(values[:, columns])
+            for name, constant in self.constants.items():
+                values[:, answer.names.index(name)] = constant
+            for name, of in self.copies.items():
+                values[:, answer.names.index(name)] = values[:, answer.names.index(of)]
             results.append(replace(answer, values=values))
         return replace(predicted, trajectories=tuple(results))
 
@@ -224,11 +281,51 @@ class Transforms:
         return Transforms(
             {name: angle for name, angle in self.angles.items() if name not in done.angles},
             tuple(four for four in self.quaternions if four not in done.quaternions),
+            {
+                name: left
+                for name, marks in self.missing.items()
+                if (left := tuple(m for m in marks if m not in done.missing.get(name, ())))
+            },
+            {n: value for n, value in self.constants.items() if n not in done.constants},
+            {n: of for n, of in self.copies.items() if n not in done.copies},
+            tuple(name for name in self.ignored if name not in done.ignored),
         )
+
+
+def masked_marks(meta: Mapping[str, Any]) -> dict[str, tuple[float, ...]]:
+    """By channel, the values that mark missing ones and were masked in a data set.
+
+    Args:
+        meta: of the data set, with what `mask_outliers` or its reader found.
+    """
+    cleaned = meta.get("cleaning", {}).get("outliers", {})
+    found = [*meta.get("outliers", ())]
+    if cleaned.get("option") == "mask":
+        found += cleaned["found"]
+    marks: dict[str, tuple[float, ...]] = {}
+    for outliers in found:
+        if outliers["kind"] in ("sentinel", "start"):
+            marks = _merged(marks, {outliers["name"]: (outliers["value"],)})
+    return marks
+
+
+def _merged(
+    some: Mapping[str, tuple[float, ...]], more: Mapping[str, tuple[float, ...]]
+) -> dict[str, tuple[float, ...]]:
+    return {
+        name: tuple(dict.fromkeys((*some.get(name, ()), *more.get(name, ()))))
+        for name in {**some, **more}
+    }
 
 
 def _transformed(trajectory: Trajectory, transforms: Transforms) -> Trajectory:
     values, observed = trajectory.values.copy(), trajectory.observed.copy()
+    for name, marks in transforms.missing.items():
+        c = trajectory.names.index(name)
+        values[np.isin(values[:, c], marks), c] = np.nan
+    for name in transforms.left_out:
+        values[:, trajectory.names.index(name)] = np.nan
+    observed &= ~np.isnan(values)
     for name, angle in transforms.angles.items():
         c = trajectory.names.index(name)
         known = ~np.isnan(values[:, c])

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from offbeat.data.batch import Batch, last_index
 from offbeat.data.scaler import clipped
+from offbeat.data.trajectory import EXOGENOUS
 from offbeat.errors import InputError
 
 
@@ -48,21 +50,24 @@ class Statistics:
                 few wild values do not change.
 
         Raises:
-            InputError: a channel is never observed, or no trajectory has two rows.
+            InputError: a channel that is not exogenous is never observed, or no trajectory has two
+                rows.
         """
         mask = batch.mask & batch.valid[..., None]
         count = mask.sum(dim=(0, 1))
-        if (count == 0).any():
-            raise InputError(
-                f"channel {int((count == 0).long().argmax())} is never observed in the training "
-                "part; leave it out"
-            )
+        for channel, (seen, role) in enumerate(zip(count.tolist(), batch.roles, strict=True)):
+            if not seen and role != EXOGENOUS:
+                raise InputError(
+                    f"channel {channel} is never observed in the training part; leave it out"
+                )
+        count = count.clamp_min(1)
         values = batch.values.double()
         mean = torch.where(mask, values, 0.0).sum(dim=(0, 1)) / count
         variance = (torch.where(mask, values - mean, 0.0) ** 2).sum(dim=(0, 1)) / count
         std = variance.sqrt()
         if robust:
-            inner = [clipped(values[..., c][mask[..., c]].cpu().numpy()) for c in range(len(count))]
+            columns = [values[..., c][mask[..., c]].cpu().numpy() for c in range(len(count))]
+            inner = [clipped(column) if len(column) else np.zeros(1) for column in columns]
             mean = torch.tensor([column.mean() for column in inner])
             std = torch.tensor([column.std() for column in inner])
         std = torch.where(std > 1e-7 * mean.abs().clamp_min(1e-30), std, 1.0)

@@ -284,7 +284,8 @@ def make_model(
 
 
 def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
-    check_observed(train.names, sum(t.observed.sum(axis=0) for t in train), len(train))
+    count = sum(t.observed.sum(axis=0) for t in train)
+    check_observed(train.names, count, len(train), roles=train.roles)
     if isinstance(scaler, str):
         scaler = Scaler.fit(scaler, train)
     elif len(scaler.shift) != train.channels:

@@ -64,7 +64,12 @@ class LiveStream:
         self.names, self.units, self.options = info.names, info.units, options
         transformed = not info.transforms.is_identity
         self._reader = RowReader(info.names, info.scaler, engine.dtype, scale=not transformed)
-        self._exogenous = [i for i, role in enumerate(info.roles) if role == EXOGENOUS]
+        given_back = {*info.transforms.constants, *info.transforms.copies}
+        self._exogenous = [
+            i
+            for i, (name, role) in enumerate(zip(info.names, info.roles, strict=False))
+            if role == EXOGENOUS and name not in given_back
+        ]
         self._scaler = Scaler.identity(len(info.names)) if transformed else info.scaler
         if transformed:
             engine = TransformedEngine(engine, info.transforms, info.names, info.scaler)

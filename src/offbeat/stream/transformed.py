@@ -55,14 +55,20 @@ class LiveTransforms:
     """
 
     def __init__(self, transforms: Transforms, names: Sequence[str]) -> None:
-        angles = transforms.restricted(names).angles
-        fours = transforms.restricted(names).quaternions
+        transforms = transforms.restricted(names)
+        angles, fours = transforms.angles, transforms.quaternions
         self._angles = np.array([names.index(name) for name in angles], dtype=np.int64)
         self._periods = np.array([angle.period for angle in angles.values()])
         self._lowest = np.array(
             [np.nan if angle.lowest is None else angle.lowest for angle in angles.values()]
         )
         self._fours = [[names.index(name) for name in four] for four in fours]
+        self._missing = [(names.index(name), marks) for name, marks in transforms.missing.items()]
+        self._left_out = [names.index(name) for name in transforms.left_out]
+        self._constants = [(names.index(name), x) for name, x in transforms.constants.items()]
+        self._copies = [
+            (names.index(one), names.index(of)) for one, of in transforms.copies.items()
+        ]
 
     def start(self) -> TransformState:
         """Returns the state before the first observation."""
@@ -89,6 +95,9 @@ class LiveTransforms:
             Values and mask for the model, and the state after the row.
         """
         values, mask = values.copy(), mask.copy()
+        for c, marks in self._missing:
+            mask[c] &= values[c] not in marks
+        mask[self._left_out] = False
         sent, seen = values[self._angles], mask[self._angles]
         step = np.where(seen & ~np.isnan(state.angle), sent - state.angle, 0.0)
         turns = state.turns + np.round(step / self._periods)
@@ -133,6 +142,10 @@ class LiveTransforms:
         )
         for four in self._fours:
             values[:, four] = unit_quaternions(values[:, four])
+        for c, constant in self._constants:
+            values[:, c] = constant
+        for c, source in self._copies:
+            values[:, c] = values[:, source]
         return values
 
 
