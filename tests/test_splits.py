@@ -25,7 +25,7 @@ from offbeat import (
     split_in_time,
     windows,
 )
-from offbeat.data.splits import load_split, save_split
+from offbeat.data.splits import load_split, save_split, split_in_blocks
 
 NAN = float("nan")
 
@@ -257,6 +257,63 @@ def test_a_log_too_short_for_its_parts_says_what_to_do():
         split_in_time(Dataset((log(50),)), (0.5, 0.2))
 
 
+# --- in blocks ------------------------------------------------------------------------------------
+
+
+def test_blocks_of_every_part_are_spread_over_the_log():
+    train, validation, test = split_in_blocks(Dataset((log(1000),)), blocks=2)
+    assert [(int(t.values[0, 0]), t.rows) for t in validation] == [(175, 75), (675, 75)]
+    assert [(int(t.values[0, 0]), t.rows) for t in test] == [(425, 75), (925, 75)]
+    assert [(int(t.values[0, 0]), t.rows) for t in train] == [
+        (0, 175),
+        (250, 175),
+        (500, 175),
+        (750, 175),
+    ]
+    assert sorted(rows_of(train) + rows_of(validation) + rows_of(test)) == list(range(1000))
+
+
+@given(st.integers(60, 900), st.integers(1, 4), st.floats(0, 0.05), st.integers(1, 4))
+def test_training_stays_a_gap_away_and_the_other_parts_lose_no_row(rows, blocks, gap, episodes):
+    data = Dataset(tuple(log(rows, start=10_000 * i) for i in range(episodes)))
+    train, validation, test = split_in_blocks(data, blocks=blocks, gap_s=gap)
+    apart = [[*rows_of(part)] for part in (train, validation, test)]
+    total = rows * episodes
+    # At an episode's border, a piece of a single row is dropped.
+    for own in apart[1:]:
+        assert abs(len(own) - 0.15 * total) <= blocks + episodes
+    other = np.array(sorted(apart[1] + apart[2]))
+    for row in apart[0]:
+        near = other[np.abs(other - row) < 1000]  # of its own episode
+        assert not len(near) or np.abs(near - row).min() * 0.01 > gap - 1e-9
+    assert len(set(sum(apart, []))) == sum(map(len, apart))
+
+
+def test_the_number_of_blocks_follows_from_the_length():
+    assert [len(split_in_blocks(Dataset((log(rows),)))[1]) for rows in (40, 600, 700, 10_000)] == [
+        1, 1, 2, 5,
+    ]  # fmt: skip
+
+
+@given(st.integers(300, 900), st.integers(5, 20), st.sampled_from(["consecutive", "random"]))
+def test_no_window_spans_two_blocks(rows, window, cut):
+    config = SplitConfig(window=window, cut=cut, by="blocks", gap_s=0.03)
+    for part in apply_split(Dataset((log(rows),)), config):
+        for one in part:
+            assert np.array_equal(np.diff(one.values[:, 0]), np.ones(one.rows - 1))
+
+
+def test_a_log_too_short_for_blocks_says_what_to_do():
+    with pytest.raises(InputError, match="use a longer recording or fewer blocks"):
+        split_in_blocks(Dataset((log(8),)))
+    with pytest.raises(InputError, match="use a longer recording or fewer blocks"):
+        split_in_blocks(Dataset((log(200),)), gap_s=10.0)
+    with pytest.raises(InputError, match="three fractions"):
+        split_in_blocks(Dataset((log(200),)), (0.5, 0.5))
+    with pytest.raises(InputError, match="sum to 1"):
+        split_in_blocks(Dataset((log(200),)), (0.5, 0.5, 0.5))
+
+
 # --- by trajectory --------------------------------------------------------------------------------
 
 
@@ -285,6 +342,7 @@ def test_fractions_hold_for_a_trajectory_that_is_cut_into_several_windows(mask):
     [
         SplitConfig(window_s=0.3, by="time", observed_fraction=0.6, mask="values", seed=4),
         SplitConfig(window=20, cut="random", window_count=3, by="time"),
+        SplitConfig(window=20, cut="random", by="blocks", blocks=2, gap_s=0.02),
         SplitConfig(
             by="time", observed_fraction=0.5, mask="dropout", burst_s=0.1,
             sensors=[["channel_0"]],
@@ -313,6 +371,9 @@ def test_parts_come_back_from_their_file(tmp_path, config):
         ({"by": "in_time"}, "trajectory"),
         ({"burst_rows": 3, "burst_s": 1.0}, "not both"),
         ({"window_s": 0.0}, "positive number of seconds"),
+        ({"by": "time", "gap_s": 1.0}, "options of by='blocks'"),
+        ({"by": "blocks", "blocks": 0}, "blocks must be an integer of at least 1"),
+        ({"by": "blocks", "gap_s": -1}, "gap_s must be seconds of at least 0"),
     ],
 )
 def test_a_config_that_contradicts_itself_is_refused(options, message):

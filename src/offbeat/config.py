@@ -150,7 +150,7 @@ MASKS = ("rows", "values", "bursts", "dropout")
 CUTS = ("one", "consecutive", "random")
 """Ways of cutting windows; see `offbeat.data.windows.windows`."""
 
-SPLITS = ("trajectory", "time")
+SPLITS = ("trajectory", "time", "blocks")
 """Ways of splitting; see `offbeat.data.splits.apply_split`."""
 
 
@@ -163,7 +163,7 @@ class SplitConfig:
         window_s: length of a window in seconds, instead of in rows.
         cut: `one` window out of each trajectory, its start drawn; `consecutive`, one after the
             other; `random`, drawn for training, consecutive for the other parts.
-            By default `one`, and `consecutive` where the split is by time.
+            By default `one`, and `consecutive` where the split is by time or in blocks.
         window_count: windows that `random` draws from each trajectory; by default as many as are
             as long as the trajectory together.
         observed_fraction: fraction of the observed values that stays observed; None masks nothing.
@@ -173,8 +173,13 @@ class SplitConfig:
         burst_s: length of a run in seconds, instead of in rows.
         sensors: channels that drop out together in `dropout`, a list of names per sensor; by
             default channels that are always observed together.
-        by: split by `trajectory`, at random, or by `time`: the first rows train, those after them
-            validate, the last ones test, and no window spans two parts.
+        by: split by `trajectory`, at random; by `time`: the first rows train, those after them
+            validate, the last ones test; or in `blocks`: each part has several, spread over the
+            log. No window spans two parts.
+        blocks: validation blocks, and as many test blocks, of a split in blocks; by default up to
+            5, with 50 rows or more in each.
+        gap_s: s, rows that are left out of the training part next to the other parts of a split in
+            blocks.
         fractions: of the trajectories, or of the rows, for training, validation and test; they sum
             to 1.
         seed: of windows, masks and split.
@@ -189,7 +194,9 @@ class SplitConfig:
     burst_rows: int | None = None
     burst_s: float | None = None
     sensors: tuple[tuple[str, ...], ...] | None = None
-    by: Literal["trajectory", "time"] = "trajectory"
+    by: Literal["trajectory", "time", "blocks"] = "trajectory"
+    blocks: int | None = None
+    gap_s: float | None = None
     fractions: tuple[float, float, float] = (0.7, 0.15, 0.15)
     seed: int = 0
 
@@ -201,8 +208,9 @@ class SplitConfig:
         one_of("way of splitting", self.by, SPLITS)
         if self.cut is not None:
             one_of("cut", self.cut, CUTS)
-        for name in ("window", "window_count", "burst_rows"):
+        for name in ("window", "window_count", "burst_rows", "blocks"):
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
+        _check(self, "gap_s", lambda v: 0 <= v < math.inf, "seconds of at least 0")
         for name in ("window_s", "burst_s"):
             _check(self, name, lambda v: 0 < v < math.inf, "a positive number of seconds")
         for rows, seconds in (("window", "window_s"), ("burst_rows", "burst_s")):
@@ -212,6 +220,8 @@ class SplitConfig:
             raise InputError(f"cut={self.cut!r} needs the length of a window: window or window_s")
         if self.window_count is not None and self.cut != "random":
             raise InputError("window_count is an option of cut='random'; leave it out")
+        if self.by != "blocks" and (self.blocks is not None or self.gap_s is not None):
+            raise InputError("blocks and gap_s are options of by='blocks'; leave them out")
         check_seed(self.seed)
 
     @property

@@ -108,6 +108,9 @@ def _read_folder(folder: Path) -> RawRun:
         split = dict(_named(config, "split"))
         scores, name = results["predictors"], str(model["name"])
         draw = str(split.pop("seed"))
+        for option in ("blocks", "gap_s"):  # runs from before they existed lack them
+            if split.get(option) is None:
+                split.pop(option, None)
         condition = {"data": Path(config["data"]).name, **split, "scaler": config["scaler"]}
         for path in (folder / "split.json", folder / "parts.json"):  # the second is of 0.1.0
             if path.is_file():

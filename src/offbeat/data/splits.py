@@ -18,6 +18,9 @@ from offbeat.data.windows import Cut, owned_windows
 from offbeat.errors import FileFormatError, InputError
 from offbeat.files import write_json
 
+_BLOCK_ROWS = 50
+_MOST_BLOCKS = 5
+
 
 def split(
     dataset: Dataset,
@@ -80,11 +83,80 @@ def split_in_time(
     return tuple(replace(dataset, trajectories=tuple(part)) for part in pieces)
 
 
+def split_in_blocks(
+    dataset: Dataset,
+    fractions: Sequence[float] = (0.7, 0.15, 0.15),
+    *,
+    blocks: int | None = None,
+    gap_s: float = 0.0,
+) -> tuple[Dataset, Dataset, Dataset]:
+    """Splits a recording in blocks: validation and test come from several places of it.
+
+    The rows are divided into as many sections as there are blocks. In each section, half of the
+    training rows come first, then a validation block, the other half, and a test block. Several
+    trajectories count as one recording, as in `split_in_time`.
+
+    Args:
+        dataset: a recording, its trajectories in the order of time.
+        fractions: of the rows for training, validation and test; they sum to 1.
+        blocks: validation blocks, and as many test blocks; by default as many as have 50 rows or
+            more, from 1 to 5.
+        gap_s: s, training rows this near to a row of another part are left out.
+
+    Returns:
+        Training, validation and test part; a trajectory per block.
+
+    Raises:
+        InputError: fractions are not three, not positive or do not sum to 1, or a part would be
+            empty.
+    """
+    rows = sum(t.rows for t in dataset)
+    if len(fractions) != 3:
+        raise InputError(f"a split in blocks has three fractions, got {list(fractions)}")
+    train, validation, test = fractions
+    _ends(rows, fractions)  # checks them
+    if blocks is None:
+        blocks = min(max(int(rows * min(validation, test)) // _BLOCK_ROWS, 1), _MOST_BLOCKS)
+    section = np.array([train / 2, validation, train / 2, test]) / blocks
+    ends = np.floor(np.cumsum(np.tile(section, blocks)) * rows + 0.5).astype(np.int64)
+    ends[-1] = rows
+    pieces: list[list[Trajectory]] = [[], [], []]
+    before = 0
+    for trajectory in dataset:
+        start = 0
+        for i, end in enumerate(ends):
+            stop = min(max(int(end) - before, start), trajectory.rows)
+            part = (0, 1, 0, 2)[i % 4]
+            first, last = start, stop
+            if part == 0 and gap_s > 0 and stop > start:
+                first, last = _apart(trajectory.times, start, stop, gap_s)
+            if last - first >= 2:
+                pieces[part].append(trajectory.slice(first, last))
+            start = stop
+        before += trajectory.rows
+    if not all(pieces):
+        raise InputError(
+            f"{rows} rows are too few to be split into {blocks} blocks of {list(fractions)}, "
+            f"{gap_s:g} s apart: a part would be empty; use a longer recording or fewer blocks"
+        )
+    made = [replace(dataset, trajectories=tuple(part)) for part in pieces]
+    return made[0], made[1], made[2]
+
+
+def _apart(times: NDArray[np.float64], start: int, stop: int, gap_s: float) -> tuple[int, int]:
+    """First row and end of the rows of a block that are `gap_s` away from those around it."""
+    if start > 0:
+        start = max(start, int(np.searchsorted(times, times[start - 1] + gap_s, side="right")))
+    if stop < len(times):
+        stop = min(stop, int(np.searchsorted(times, times[stop] - gap_s, side="left")))
+    return start, stop
+
+
 def apply_split(dataset: Dataset, config: SplitConfig) -> tuple[Dataset, Dataset, Dataset]:
     """Cuts windows, masks values and splits, all from one seed.
 
-    By trajectory, all windows of a trajectory are in one part. By time, the recording is split
-    first, so that no window spans two parts. Where each trajectory gives one window, values are
+    By trajectory, all windows of a trajectory are in one part. By time and in blocks, the recording
+    is split first, so that no window spans two parts. Where each trajectory gives one window, values are
     masked in the windows; where it gives several, they are masked before it is cut, so that the
     fraction holds for the trajectory, or for its part in time. `random` windows are for training:
     validation and test are cut consecutively, so that each of their rows counts once.
@@ -97,17 +169,23 @@ def apply_split(dataset: Dataset, config: SplitConfig) -> tuple[Dataset, Dataset
         Training, validation and test part.
 
     Raises:
-        InputError: as of `windows`, `mask_out`, `split` and `split_in_time`.
+        InputError: as of `windows`, `mask_out`, `split`, `split_in_time` and `split_in_blocks`.
     """
     dataset = Dataset.of(dataset)
-    if config.by == "time":
-        in_time = split_in_time(dataset, config.fractions)
-        dataset = replace(dataset, trajectories=tuple(t for part in in_time for t in part))
-        ends = np.cumsum([len(part) for part in in_time])
+    if config.by != "trajectory":
+        parts: Sequence[Dataset] = (
+            split_in_time(dataset, config.fractions)
+            if config.by == "time"
+            else split_in_blocks(
+                dataset, config.fractions, blocks=config.blocks, gap_s=config.gap_s or 0.0
+            )
+        )
+        dataset = replace(dataset, trajectories=tuple(t for part in parts for t in part))
+        ends = np.cumsum([len(part) for part in parts])
         index_of = np.split(np.arange(len(dataset)), ends[:-1])
     else:
         index_of = _drawn(len(dataset), config.fractions, config.seed)
-    cut: Cut = config.cut or ("consecutive" if config.by == "time" else "one")
+    cut: Cut = config.cut or ("one" if config.by == "trajectory" else "consecutive")
     owners = np.arange(len(dataset))
     if config.observed_fraction is not None and cut != "one":
         dataset = mask_out(dataset, seed=config.seed, **config.masking)
@@ -137,7 +215,7 @@ def _drawn(count: int, fractions: Sequence[float], seed: int) -> list[NDArray[np
         raise InputError(
             f"{count} trajectories are too few for the fractions {list(fractions)}: a part "
             "would be empty; use more trajectories or fewer parts, or split a long recording "
-            "by time (by='time')"
+            "by time (by='time') or in blocks (by='blocks')"
         )
     order = np.random.default_rng(seed).permutation(count)
     return [np.sort(order[start:end]) for start, end in zip(starts, ends, strict=True)]
