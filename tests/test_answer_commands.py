@@ -239,7 +239,7 @@ def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
         (["impute", run, log, out.with_suffix(".txt")], ".txt"),
         (["impute", run, log, log], str(log)),
         (["impute", run, log, out, "--mode=both"], "'both'"),
-        (["impute", run / "model", log, out, "--mode=two_sided", *READER], "--two_sided"),
+        (["impute", run / "model", log, out, "--mode=two_sided", *READER], "blend"),
         (["impute", run, log, out, "--figure=a.gif"], ".gif"),
         (["impute", run, log, out, "--channels=[tilts]"], "did you mean 'tilt'"),
         (["impute", run, log, out, "--trajectory=1"], "--trajectory"),

@@ -212,3 +212,64 @@ def test_answers_stay_in_the_range_of_training_and_say_where_they_are_beyond(ble
 
 def test_bins_of_lengths_end_at_the_longest():
     assert AgeBins.of_lengths(0.01, 0.1).edges.tolist() == pytest.approx([0.015, 0.03, 0.06, 0.12])
+
+
+# --- with models ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def with_models(blend):
+    train, validation = waves(0), waves(1, 4)
+    model = ob.make_model("gru", train, seed=0)
+    backward = ob.make_model("gru", train, seed=1)
+    return fit_blend(train, validation, model, backward, tasks=blend.tasks)
+
+
+def test_a_model_with_nothing_to_say_changes_little(with_models):
+    # The third channel is noise, and before the first observation nobody knows more.
+    assert with_models.gamma[:-1, :2].max() < 0.3
+
+
+def test_a_saved_blend_answers_the_same(with_models, tmp_path):
+    from offbeat.answers.saved import load_blend, load_run, save_blend
+
+    save_blend(with_models, tmp_path / "run")
+    again = load_run(tmp_path / "run")
+    data = ob.mask_out(waves(4, 2), 0.5, mask="bursts", burst_rows=10)
+    for ask in (
+        lambda b: ob.predict(b, data, times=[0.5, 0.7]),
+        lambda b: ob.forecast(b, data, [0.1, 0.2]),
+        lambda b: ob.impute(b, data),
+        lambda b: ob.impute(b, data, mode="causal"),
+    ):
+        for a, b in zip(ask(with_models), ask(again), strict=True):
+            assert np.array_equal(a.values, b.values)
+            assert np.array_equal(a.interval(0.8)[0], b.interval(0.8)[0])
+    (tmp_path / "run" / "blend.safetensors").write_bytes(b"x")
+    with pytest.raises(ob.FileFormatError, match="damaged"):
+        load_blend(tmp_path / "run")
+
+
+def test_a_blend_of_another_model_is_refused(with_models, tmp_path):
+    from offbeat.answers.saved import load_blend, save_blend
+
+    save_blend(with_models, tmp_path / "run")
+    ob.make_model("gru", waves(0), seed=5).save(tmp_path / "run" / "model")
+    with pytest.raises(ob.FileFormatError, match="another forward model"):
+        load_blend(tmp_path / "run")
+
+
+def test_a_fill_keeps_what_was_observed(with_models):
+    data = ob.mask_out(waves(4, 2), 0.5, mask="bursts", burst_rows=10)
+    for given, filled in zip(data, ob.impute(with_models, data), strict=True):
+        seen = given.observed
+        assert np.array_equal(filled.values[seen], given.values[seen])
+        assert (filled.half_width(0.9)[seen] == 0).all()
+        assert (filled.half_width(0.9)[~seen] > 0).all()
+        assert np.array_equal(filled.observed, seen)
+
+
+def test_the_answer_of_a_model_alone_has_no_intervals(with_models):
+    answer = ob.predict(with_models.forward, waves(4, 1))[0]
+    with pytest.raises(ob.InputError, match="no intervals"):
+        answer.interval()

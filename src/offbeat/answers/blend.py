@@ -31,10 +31,9 @@ from offbeat.baselines.base import Array
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.stack import Stack, errors_of, fit_stack, independent_tasks, kinds_of, within
 from offbeat.data.tasks import CAUSAL, TWO_SIDED, TaskConfig, draw_tasks
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
-from offbeat.errors import InputError
-from offbeat.models.base import BaseModel
+from offbeat.models.base import BaseModel, of_channels
 
 CAUSAL_MEMBERS = ("last_value", "constant_velocity", "damped_slope", "mean", "running_mean")
 """Causal baselines of a blend."""
@@ -85,6 +84,11 @@ class Blend:
     def channels(self) -> int:
         """Number of channels."""
         return len(self.names)
+
+    @property
+    def predicted(self) -> NDArray[np.bool_]:
+        """(channels,) True where the channel is predicted; exogenous ones are not."""
+        return np.array([role != EXOGENOUS for role in self.roles])
 
     def causal(self, dataset: Dataset, *, seed: int = 0) -> list[Answer]:
         """Predicts every row from what was observed strictly before it.
@@ -214,12 +218,8 @@ def fit_blend(
     train, validation = Dataset.of(train), Dataset.of(validation)
     transforms = model.transforms if model is not None else Transforms.of(train)
     if model is not None:
-        if set(train.names) != set(model.names):
-            raise InputError(
-                f"the data has channels {', '.join(train.names)}, the model was made for "
-                f"{', '.join(model.names)}; give both the same"
-            )
-        train, validation = train.select(model.names), validation.select(model.names)
+        train = of_channels(train, model.names, model.units)
+        validation = of_channels(validation, model.names, model.units)
     train, validation = transforms.apply(train), transforms.apply(validation)
     gap = typical_gap(train)
     config = tasks or TaskConfig(horizon_s=16 * gap, gap_s=gap)

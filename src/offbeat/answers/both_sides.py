@@ -24,9 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
-from offbeat.baselines.base import BASELINES, Array, Baseline, fit_baseline
+from offbeat.baselines.base import Array, Baseline, fit_baseline
 from offbeat.baselines.history import AgeBins
-from offbeat.baselines.stack import cross_fitted, independent_tasks, joined, within
+from offbeat.baselines.stack import (
+    arrays_of,
+    cross_fitted,
+    independent_tasks,
+    joined,
+    members_of,
+)
 from offbeat.baselines.weights import Errors, gate, simplex_weights
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
@@ -176,7 +182,8 @@ class BothSides:
 
     def arrays(self) -> dict[str, Array]:
         """What is saved."""
-        own = {
+        return {
+            **arrays_of(self.members),
             "edges": self.keys.bins.edges,
             "weights": self.weights,
             "gamma": self.gamma,
@@ -184,16 +191,12 @@ class BothSides:
             "widths_count": self.widths.count,
             "units": self.units,
         }
-        for name, member in self.members.items():
-            own |= {f"member.{name}.{k}": v for k, v in member.arrays().items()}
-        return own
 
     @classmethod
     def restored(cls, arrays: Mapping[str, Array]) -> BothSides:
         """The inverse of `arrays`."""
-        names = dict.fromkeys(k.split(".")[1] for k in arrays if k.startswith("member."))
         return cls(
-            {n: BASELINES[n]().restore(within(arrays, f"member.{n}.")) for n in names},
+            members_of(arrays),
             SideKeys(AgeBins(arrays["edges"])),
             arrays["weights"],
             arrays["gamma"],

@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.answers.blend import Blend
 from offbeat.answers.predict import increasing_seconds, predict
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
 from offbeat.models.base import BaseModel
 
 
-def forecast(model: BaseModel, dataset: Dataset, horizons: ArrayLike) -> Dataset:
+def forecast(model: BaseModel | Blend, dataset: Dataset, horizons: ArrayLike) -> Dataset:
     """Predicts each trajectory after its last row.
 
     Args:
-        model: trained.
+        model: a trained model, or a blend, whose forecasts have intervals.
         dataset: the observed data.
         horizons: s after the last row: one number, or several that increase strictly, above 0.
 

@@ -9,13 +9,15 @@ from typing import Literal
 
 import numpy as np
 
+from offbeat.answers.answer import Answer
+from offbeat.answers.blend import Blend
 from offbeat.answers.fill_rule import FillRule
 from offbeat.answers.predict import (
     Times,
     check_any_time,
-    in_model_order,
     predict,
     times_of_each,
+    without_exogenous,
 )
 from offbeat.answers.two_sided import (
     TwoSided,
@@ -25,10 +27,10 @@ from offbeat.answers.two_sided import (
 )
 from offbeat.config import TrainConfig
 from offbeat.data.rows import add_rows, times_at_rate
-from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
 from offbeat.files import write_json
-from offbeat.models.base import BaseModel
+from offbeat.models.base import BaseModel, of_channels
 from offbeat.models.checkpoint import load_model, save_model
 from offbeat.models.model import Model
 from offbeat.models.zoo import make_model
@@ -42,7 +44,7 @@ RULE_FILE = "two_sided.json"
 
 
 def impute(
-    model: BaseModel | TwoSided,
+    model: BaseModel | Blend | TwoSided,
     dataset: Dataset,
     *,
     mode: Literal["causal", "two_sided"] | None = None,
@@ -79,7 +81,7 @@ def impute(
     """
     dataset = Dataset.of(dataset)
     forward = model.forward if isinstance(model, TwoSided) else model
-    mode = mode or ("two_sided" if isinstance(model, TwoSided) else "causal")
+    mode = mode or ("causal" if isinstance(model, BaseModel) else "two_sided")
     one_of("mode", mode, MODES)
     if times is not None and rate_hz is not None:
         raise InputError("give times or rate_hz, not both")
@@ -93,42 +95,50 @@ def impute(
         rows = (add_rows(t, at) for t, at in zip(dataset, added, strict=True))
         dataset = replace(dataset, trajectories=tuple(rows))
     transforms = forward.transforms
-    dataset = in_model_order(forward, dataset)
+    dataset = of_channels(dataset, forward.names, forward.units)
     applied = transforms.apply(dataset)
     if mode == "causal":
-        fills = [t.values for t in predict(forward, applied, seed=seed)]
+        answers = [t for t in predict(forward, applied, seed=seed) if isinstance(t, Answer)]
+    elif isinstance(model, Blend):
+        answers = [without_exogenous(a, model.predicted) for a in model.fill(applied, seed=seed)]
     elif isinstance(model, TwoSided):
-        fills = fill_two_sided(model, applied, seed=seed)
-    else:
-        raise InputError(
-            "mode 'two_sided' needs a backward model, got a single model; train both with "
-            "fit_two_sided (offbeat train --two_sided true), or fill with mode 'causal'"
-        )
-    filled = Dataset(
-        tuple(
-            Trajectory(
+        answers = [
+            Answer(
                 t.times,
                 np.where(forward.predicted, values, np.nan),  # exogenous channels are not filled
                 names=forward.names,
                 units=forward.units,
             )
-            for t, values in zip(applied, fills, strict=True)
-        ),
-        {**dataset.meta, "filled_by": forward.name, "filled": mode},
-    )
-    undone = transforms.undo(filled, dataset)
-    return replace(
-        filled,
-        trajectories=tuple(
+            for t, values in zip(applied, fill_two_sided(model, applied, seed=seed), strict=True)
+        ]
+    else:
+        raise InputError(
+            "mode 'two_sided' needs a blend, got a single model; train one with offbeat train, or "
+            "fit_blend, or fill with mode 'causal'"
+        )
+    notes = {**dataset.meta, "filled_by": model_name(model), "filled": mode}
+    undone = transforms.undo(Dataset(tuple(answers), notes), dataset)
+    filled = []
+    for t, given in zip(undone, dataset, strict=True):
+        assert isinstance(t, Answer)
+        seen = given.observed
+        filled.append(
             replace(
-                given,
-                values=np.where(given.observed, given.values, t.values),
-                names=forward.names,
-                units=forward.units,
+                t,
+                values=np.where(seen, given.values, t.values),
+                observed=seen,
+                roles=given.roles,
+                origin=given.origin,
+                unit=None if t.unit is None else np.where(seen, 0.0, t.unit),
+                beyond=None if t.beyond is None else t.beyond & ~seen,
             )
-            for t, given in zip(undone, dataset, strict=True)
-        ),
-    )
+        )
+    return Dataset(tuple(filled), notes)
+
+
+def model_name(model: BaseModel | Blend | TwoSided) -> str:
+    """Name in tables and files."""
+    return model.forward.name if isinstance(model, TwoSided) else model.name
 
 
 def fit_two_sided(

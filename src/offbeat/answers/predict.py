@@ -7,20 +7,22 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.answers.answer import Answer
+from offbeat.answers.blend import Blend, model_rows
 from offbeat.config import check_seed
+from offbeat.data.rows import add_rows
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
-from offbeat.models.base import BaseModel
+from offbeat.models.base import BaseModel, of_channels
 from offbeat.models.model import Model
 
 Times = ArrayLike | Sequence[ArrayLike]
 
 
 def predict(
-    model: BaseModel,
+    model: BaseModel | Blend,
     dataset: Dataset,
     *,
     times: Times | None = None,
@@ -34,7 +36,7 @@ def predict(
     row in which nothing is observed.
 
     Args:
-        model: trained.
+        model: a trained model, or a blend, whose answers have intervals.
         dataset: what was observed; masked values are not used.
         times: s, on the clock of the trajectories, strictly increasing: one time or one array for
             all trajectories, or one array per trajectory. By default the times of each
@@ -45,7 +47,7 @@ def predict(
     Returns:
         One trajectory of predictions per trajectory, in original units, at the requested times;
         its channels are in the order of the model. Exogenous channels, which are not predicted, are
-        NaN.
+        NaN. Each is an `Answer`.
 
     Raises:
         InputError: other channels than the model's, times that are not finite numbers in
@@ -60,33 +62,48 @@ def predict(
         check_any_time(model)
     asked = [t.times for t in dataset] if times is None else times_of_each(times, len(dataset))
     transforms = model.transforms
-    applied = transforms.apply(dataset)
+    applied = transforms.apply(of_channels(dataset, model.names, model.units))
     results: list[Trajectory] = []
     for first in range(0, len(dataset), size):
         part = applied[first : first + size]
-        merged = [
-            _with_rows_at(t, at) for t, at in zip(part, asked[first : first + size], strict=True)
-        ]
-        batch = model.batch(replace(part, trajectories=tuple(t for t, _ in merged)))
-        # One generator for all parts, as if they were one batch.
-        drawn = {"generator": torch.Generator().manual_seed(seed)} if model.needs_generator else {}
-        with torch.inference_mode():
-            scaled = model(batch, **drawn).mean.double().cpu().numpy()
-        for (union, rows), trajectory, values in zip(merged, part, scaled, strict=True):
-            results.append(
-                Trajectory(
-                    union.times[rows],
-                    np.where(model.predicted, model.scaler.original(values[rows]), np.nan),
-                    names=model.names,
-                    units=model.units,
-                    roles=model.roles,
-                    origin=trajectory.origin,
-                )
-            )
+        asked_here = asked[first : first + size]
+        merged = tuple(add_rows(t, at) for t, at in zip(part, asked_here, strict=True))
+        answers = _every_row(model, replace(part, trajectories=merged), seed)
+        for union, at, answer in zip(merged, asked_here, answers, strict=True):
+            results.append(answer.rows_at(np.searchsorted(union.times, at)))
     return transforms.undo(Dataset(tuple(results), {"predicted_by": model.name}), dataset)
 
 
-def in_model_order(model: BaseModel, dataset: Dataset) -> Dataset:
+def _every_row(model: BaseModel | Blend, dataset: Dataset, seed: int) -> list[Answer]:
+    """The answers at every row of a data set that is transformed and in the model's order."""
+    if isinstance(model, Blend):
+        answers = model.causal(dataset, seed=seed)
+    else:
+        rows = model_rows(model, dataset, seed=seed, size=len(dataset))
+        assert rows is not None
+        answers = [
+            Answer(
+                t.times,
+                values,
+                names=model.names,
+                units=model.units,
+                roles=model.roles,
+                origin=t.origin,
+            )
+            for t, values in zip(dataset, rows, strict=True)
+        ]
+    return [without_exogenous(answer, model.predicted) for answer in answers]
+
+
+def without_exogenous(answer: Answer, predicted: NDArray[np.bool_]) -> Answer:
+    """An answer that is NaN in channels that are not predicted."""
+    if predicted.all():
+        return answer
+    values = np.where(predicted, answer.values, np.nan)
+    return replace(answer, values=values, observed=answer.observed & predicted)
+
+
+def in_model_order(model: BaseModel | Blend, dataset: Dataset) -> Dataset:
     """The data set with its channels in the order of the model; unchanged if the channels differ.
 
     Actions that the model does not know are left out.
@@ -144,7 +161,7 @@ def times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
     return [increasing_seconds(at, f"times of trajectory {i}") for i, at in enumerate(each)]
 
 
-def check_any_time(model: BaseModel) -> None:
+def check_any_time(model: BaseModel | Blend) -> None:
     """Checks that a row in which nothing is observed changes no other prediction.
 
     Args:
@@ -153,6 +170,7 @@ def check_any_time(model: BaseModel) -> None:
     Raises:
         InputError: it would change one.
     """
+    model = model.forward if isinstance(model, Blend) else model  # type: ignore[assignment]
     if not isinstance(model, Model):
         return
     for field, value, meaning in (
@@ -169,19 +187,3 @@ def check_any_time(model: BaseModel) -> None:
                 f"a model with {field}={found!r} {meaning}: it can't predict at other times than "
                 f"those of its rows; leave times out, or train one with another {field}"
             )
-
-
-def _with_rows_at(
-    trajectory: Trajectory, times: NDArray[np.float64]
-) -> tuple[Trajectory, NDArray[np.int64]]:
-    """The trajectory with a row at each of the times (new ones empty), and their indices."""
-    union = np.union1d(trajectory.times, times)
-    rows = np.searchsorted(union, times)
-    if len(union) == trajectory.rows:
-        return trajectory, rows
-    own = np.searchsorted(union, trajectory.times)
-    values = np.full((len(union), trajectory.channels), np.nan)
-    observed = np.zeros(values.shape, dtype=bool)
-    values[own], observed[own] = trajectory.values, trajectory.observed
-    merged = replace(trajectory, times=union, values=values, observed=observed)
-    return merged, rows

@@ -1,4 +1,4 @@
-"""Scores of fills, forecasts and trivial predictors on the same values, in their units."""
+"""Scores of models, blends and baselines on the same values: one step, fills and forecasts."""
 
 from __future__ import annotations
 
@@ -11,16 +11,22 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat import tables
+from offbeat.answers.answer import Answer
+from offbeat.answers.blend import Blend, model_fills, model_rows
 from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
-from offbeat.answers.predict import in_model_order, predict
+from offbeat.answers.predict import check_any_time
 from offbeat.answers.two_sided import TwoSided
-from offbeat.baselines import fill, fillers, forecast, forecasters
+from offbeat.baselines import Baseline, fill, fillers, forecasters
+from offbeat.baselines.history import typical_gap
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
 from offbeat.metrics import gap_groups, null_if_nan
-from offbeat.models.base import BaseModel
+from offbeat.models.base import BaseModel, of_channels
+
+COVERED = (0.5, 0.8, 0.95)
+"""Levels of the intervals whose coverage is scored."""
 
 OVERALL = "all, scaled"
 """Name of the last row of a table: all channels, in units of their standard deviation."""
@@ -37,7 +43,11 @@ class ChannelScores:
         counts: per channel, how many values were scored.
         rmse: per predictor, per channel; NaN where a channel has no value.
         overall: per predictor, over the values of all channels, each in units of its scale.
-        trivial: which of the predictors are trivial.
+        trivial: which of the predictors are baselines.
+        coverage: share of the values within the intervals of 50, 80 and 95 %, by that level; None
+            where the predictor has no intervals.
+        crps: continuous ranked probability score over the values of all channels, each in units of
+            its scale; None without intervals.
     """
 
     task: str
@@ -47,6 +57,8 @@ class ChannelScores:
     rmse: Mapping[str, tuple[float, ...]]
     overall: Mapping[str, float]
     trivial: tuple[str, ...]
+    coverage: Mapping[float, float] | None = None
+    crps: float | None = None
 
     def table(self) -> str:
         """A plain-text table with a row per channel and a column per predictor."""
@@ -61,7 +73,7 @@ class ChannelScores:
         return tables.plain(lines)
 
     def verdict(self) -> str:
-        """A sentence on the best predictor, and on channels where a trivial one is better."""
+        """A sentence on the best predictor, and on channels where a baseline is better."""
         ranked = sorted((v, name) for name, v in self.overall.items() if v == v)
         if not ranked:
             return f"{self.task}: nothing to score"
@@ -71,13 +83,13 @@ class ChannelScores:
         if not models or models[0][0] >= best_trivial[0]:
             against = f", the model has {_shown(models[0][0])}" if models else ""
             text.append(
-                f"the trivial predictor {best_trivial[1]} wins with RMSE "
+                f"the baseline {best_trivial[1]} wins with RMSE "
                 f"{_shown(best_trivial[0])} (scaled){against}"
             )
         else:
             text.append(
-                f"{models[0][1]} wins with RMSE {_shown(models[0][0])} (scaled), the best trivial "
-                f"predictor, {best_trivial[1]}, has {_shown(best_trivial[0])}"
+                f"{models[0][1]} wins with RMSE {_shown(models[0][0])} (scaled), the best "
+                f"baseline, {best_trivial[1]}, has {_shown(best_trivial[0])}"
             )
         lost = []
         for i, name in enumerate(self.names):
@@ -86,9 +98,7 @@ class ChannelScores:
                 lost.append(f"{name} ({who})")
         if lost:
             shown = ", ".join(lost[:8]) + (", ..." if len(lost) > 8 else "")
-            text.append(
-                f"; a trivial predictor wins in {len(lost)} of {len(self.names)} channels: {shown}"
-            )
+            text.append(f"; a baseline wins in {len(lost)} of {len(self.names)} channels: {shown}")
         return "".join(text)
 
     def to_dict(self) -> dict[str, Any]:
@@ -103,7 +113,40 @@ class ChannelScores:
             },
             "rmse_scaled": {name: null_if_nan(value) for name, value in self.overall.items()},
             "verdict": self.verdict(),
+            **self._intervals(),
         }
+
+    def _intervals(self) -> dict[str, Any]:
+        if self.coverage is None:
+            return {}
+        covered = {f"{level:g}": share for level, share in self.coverage.items()}
+        return {"coverage": covered, "crps_scaled": self.crps}
+
+    def short(self) -> str:
+        """A plain-text table with a row per channel: the predictor, and the best baseline."""
+        (name, *_) = self.rmse
+        lines = [["channel", "unit", "values", name, "best baseline", "", "ratio"]]
+        each = zip(self.names, self.units, self.counts, strict=True)
+        for i, (channel, unit, count) in enumerate(each):
+            own = self.rmse[name][i]
+            best, who = min((self.rmse[p][i], p) for p in self.trivial)
+            ratio = own / best if best > 0 else float("nan")
+            row = [_shown(own), _shown(best), who if count else "", _shown(ratio)]
+            lines.append([channel, unit or "-", str(count), *row])
+        best, who = min((self.overall[p], p) for p in self.trivial)
+        own = self.overall[name]
+        lines.append(
+            [
+                OVERALL,
+                "-",
+                str(sum(self.counts)),
+                _shown(own),
+                _shown(best),
+                who,
+                _shown(own / best if best > 0 else float("nan")),
+            ]
+        )
+        return tables.plain(lines, left=(0, 5))
 
 
 class ErrorSums:
@@ -120,6 +163,8 @@ class ErrorSums:
         self.scale = np.asarray(scale, dtype=np.float64)
         self._counts = np.zeros(len(self.names), dtype=np.int64)
         self._sums: dict[str, NDArray[np.float64]] = {}
+        self._inside = dict.fromkeys(COVERED, 0)
+        self._crps: float | None = None
 
     def add(
         self,
@@ -139,6 +184,22 @@ class ErrorSums:
             squared = np.where(counted, values - truth, 0.0) ** 2
             self._sums[name] = self._sums.get(name, 0.0) + squared.sum(axis=0)
 
+    def add_intervals(
+        self, truth: NDArray[np.float64], answer: Answer, counted: NDArray[np.bool_]
+    ) -> None:
+        """Adds the intervals of rows that were added.
+
+        Args:
+            truth: (rows, channels) known where counted.
+            answer: with intervals.
+            counted: (rows, channels) values that are scored.
+        """
+        true = np.where(counted, truth, answer.values)
+        for level in COVERED:
+            half = answer.half_width(level)
+            self._inside[level] += int((np.abs(true - answer.values) <= half)[counted].sum())
+        self._crps = (self._crps or 0.0) + float((answer.crps(true) / self.scale)[counted].sum())
+
     def scores(self, task: str, trivial: Sequence[str]) -> ChannelScores:
         """The scores of all rows added so far."""
         counts, total = self._counts, int(self._counts.sum())
@@ -153,8 +214,17 @@ class ErrorSums:
             name: float((sums / self.scale**2).sum() / total) ** 0.5 if total else float("nan")
             for name, sums in self._sums.items()
         }
+        with_intervals = self._crps is not None and total > 0
         return ChannelScores(
-            task, self.names, self.units, tuple(counts.tolist()), each, overall, tuple(trivial)
+            task,
+            self.names,
+            self.units,
+            tuple(counts.tolist()),
+            each,
+            overall,
+            tuple(trivial),
+            {level: n / total for level, n in self._inside.items()} if with_intervals else None,
+            self._crps / total if self._crps is not None and total else None,
         )
 
 
@@ -182,7 +252,7 @@ class ImputationScores:
         return self.scores.table() + (by_gap if self.inside else "")
 
     def verdict(self) -> str:
-        """A sentence on the best predictor, and on gaps where a trivial one is better."""
+        """A sentence on the best predictor, and on gaps where a baseline is better."""
         text = self.scores.verdict()
         lost = []
         for up_to, scores in self.inside:
@@ -190,7 +260,7 @@ class ImputationScores:
             if value == value and who in scores.trivial:
                 lost.append(f"{up_to:.3g} s ({who})")
         if lost:
-            text += f"; in gaps of up to {', '.join(lost)} a trivial predictor wins"
+            text += f"; in gaps of up to {', '.join(lost)} a baseline wins"
         return text
 
     def to_dict(self) -> dict[str, Any]:
@@ -205,80 +275,86 @@ class ImputationScores:
         }
 
 
-def fills_of(
-    model: BaseModel | TwoSided, dataset: Dataset, *, seed: int = 0
-) -> dict[str, list[NDArray[np.float64]]]:
-    """The fills of each predictor by name: the model, causal and two-sided, and trivial ones.
+def score_one_step(model: BaseModel | Blend, dataset: Dataset, *, seed: int = 0) -> ChannelScores:
+    """Scores the prediction of every row from the rows before it.
+
+    Every known value after the first observation of its channel counts, for every predictor.
 
     Args:
-        model: a trained model, or a pair.
-        dataset: in the order of the model's channels.
+        model: a trained model, or a blend, which is scored beside its model and its baselines.
+        dataset: masked values are not used as input, and are scored as well.
         seed: of the generator of self-feeding.
 
-    Returns:
-        Per predictor and trajectory (rows, channels) in original units.
+    Raises:
+        InputError: other channels than the model's.
     """
-    forward = model.forward if isinstance(model, TwoSided) else model
-    result = {"causal": [t.values for t in impute(forward, dataset, seed=seed)]}
-    if isinstance(model, TwoSided):
-        result["two_sided"] = [t.values for t in impute(model, dataset, seed=seed)]
-    mean = training_mean(forward)
-    for method in fillers():
-        result[method] = [fill(t, method, mean) for t in dataset]
-    return result
+    dataset = _prepared(model, dataset)
+    counted = []
+    for t in dataset:
+        seen = np.zeros_like(t.observed)
+        seen[1:] = np.logical_or.accumulate(t.observed, axis=0)[:-1]
+        counted.append(t.known & seen)
+    return _scored("one step ahead", model, dataset, counted, seed=seed)
 
 
 def score_imputation(
-    model: BaseModel | TwoSided, dataset: Dataset, *, seed: int = 0
+    model: BaseModel | Blend | TwoSided,
+    dataset: Dataset,
+    *,
+    mode: str | None = None,
+    seed: int = 0,
 ) -> ImputationScores:
-    """Scores fills of all masked values: the model, last value, linear interpolation and PCHIP.
+    """Scores fills of all masked values: the model's and those of baselines.
 
     Every value that is known and masked counts, for every predictor.
 
     Args:
-        model: a trained model, or a pair, which is scored causal and two-sided.
+        model: a trained model; or a blend, which is scored beside its model and its baselines.
         dataset: with masked values, from `mask_out`.
+        mode: of a blend: `causal`, or, by default, `two_sided`.
         seed: of the generator of self-feeding.
 
     Raises:
         InputError: nothing is masked, or other channels than the model's.
     """
-    forward = model.forward if isinstance(model, TwoSided) else model
-    dataset = forward.transforms.apply(in_model_order(forward, dataset))
+    dataset = _prepared(model, dataset)
     if not any(masked_values(t).any() for t in dataset):
         raise InputError(
             "no value is known and masked, so no fill can be scored; mask some with mask_out "
             "(--observed_fraction)"
         )
-    fills = fills_of(model, dataset, seed=seed)
-    unit = forward.statistics.median_gap
-    sums = _sums_for(forward)
+    unit = typical_gap(dataset)
+    fills, answers, trivial = _fills(model, dataset, mode or "two_sided", seed)
+    sums = _sums_for(model)
     grouped: dict[int, ErrorSums] = {}
     for i, trajectory in enumerate(dataset):
         counted = masked_values(trajectory)
         each = {name: values[i] for name, values in fills.items()}
         sums.add(trajectory.values, each, counted)
+        if answers is not None:
+            sums.add_intervals(trajectory.values, answers[i], counted)
         length = _gap_lengths(trajectory)
         group = gap_groups(torch.from_numpy(length), unit).numpy()
         for k in np.unique(group[counted & (length > 0)]).tolist():
             chosen = counted & (length > 0) & (group == k)
-            grouped.setdefault(k, _sums_for(forward)).add(trajectory.values, each, chosen)
+            grouped.setdefault(k, _sums_for(model)).add(trajectory.values, each, chosen)
     inside = tuple(
-        (unit * 2.0**k, grouped[k].scores("imputation", fillers())) for k in sorted(grouped)
+        (unit * 2.0**k, grouped[k].scores("imputation", trivial)) for k in sorted(grouped)
     )
-    return ImputationScores(sums.scores("imputation", fillers()), inside)
+    name = "imputation" if not isinstance(model, Blend) else f"imputation, {mode or 'two_sided'}"
+    return ImputationScores(sums.scores(name, trivial), inside)
 
 
 def score_forecast(
-    model: BaseModel, dataset: Dataset, horizons: ArrayLike, *, targets: int = 20
+    model: BaseModel | Blend, dataset: Dataset, horizons: ArrayLike, *, targets: int = 20
 ) -> tuple[ChannelScores, ...]:
-    """Scores forecasts at fixed horizons: the model, last value and constant velocity.
+    """Scores forecasts at fixed horizons: the model's and those of baselines.
 
     For a row at time t and a horizon h, every predictor is given the rows up to t - h and predicts
     t; the values of that row which are known, and whose channel was observed by t - h, count.
 
     Args:
-        model: trained.
+        model: a trained model, or a blend, which is scored beside its model and its baselines.
         dataset: masked values are not used as input, and are scored as well.
         horizons: s, above 0, strictly increasing.
         targets: rows per trajectory and horizon, evenly spaced among those that can be scored.
@@ -290,26 +366,20 @@ def score_forecast(
         InputError: horizons as of `forecast`, no row can be scored, other channels than the
             model's, or a model that cannot predict at any time.
     """
-    dataset = model.transforms.apply(in_model_order(model, dataset))
+    dataset = _prepared(model, dataset)
     if isinstance(targets, bool) or not isinstance(targets, int) or targets < 1:
         raise InputError(f"targets must be a number of rows of at least 1, got {targets!r}")
-    mean = training_mean(model)
-    results = []
     after: list[float] = checked_horizons(horizons).tolist()
+    check_any_time(model)
+    results = []
     for horizon in after:
-        tasks = [task for t in dataset for task in _targets(t, horizon, targets)]
+        tasks, counted = forecast_tasks(dataset, horizon, targets)
         name = f"forecast, {horizon:g} s"
-        sums = _sums_for(model)
-        if tasks:
-            pasts = replace(dataset, trajectories=tuple(past for past, _, _, _ in tasks))
-            asked = [np.array([at]) for _, at, _, _ in tasks]
-            predicted = predict(model, pasts, times=asked)
-            for (past, at, truth, counted), answer in zip(tasks, predicted, strict=True):
-                each = {model.name: answer.values}
-                for method in forecasters():
-                    each[method] = forecast(past, np.array([at]), method, mean)
-                sums.add(truth, each, counted)
-        results.append(sums.scores(name, forecasters()))
+        results.append(
+            _scored(name, model, tasks, counted)
+            if tasks is not None
+            else _sums_for(model).scores(name, ())
+        )
     if not any(sum(scores.counts) for scores in results):
         raise InputError(
             f"no trajectory is long enough for a horizon of {after[0]:g} s after an observation; "
@@ -318,15 +388,128 @@ def score_forecast(
     return tuple(results)
 
 
+def forecast_tasks(
+    dataset: Dataset, horizon: float, targets: int
+) -> tuple[Dataset | None, list[NDArray[np.bool_]]]:
+    """Trajectories that end with a row to forecast, and which of their values count.
+
+    Args:
+        dataset: to cut.
+        horizon: s between the last row that is shown and the row to forecast.
+        targets: per trajectory.
+
+    Returns:
+        The tasks, None where there is none, and (rows, channels) bool for each.
+    """
+    tasks, counted = [], []
+    for trajectory in dataset:
+        for past, at, truth, counts in _targets(trajectory, horizon, targets):
+            tasks.append(
+                replace(
+                    past,
+                    times=np.append(past.times, at),
+                    values=np.vstack([past.values, np.where(counts, truth, np.nan)]),
+                    observed=np.vstack([past.observed, np.zeros_like(counts)]),
+                )
+            )
+            counted.append(np.vstack([np.zeros_like(past.observed), counts]))
+    return (replace(dataset, trajectories=tuple(tasks)) if tasks else None), counted
+
+
+_Predictions = Mapping[str, list[NDArray[np.float64]]]
+
+
+def _prepared(model: BaseModel | Blend | TwoSided, dataset: Dataset) -> Dataset:
+    made: BaseModel | Blend = model.forward if isinstance(model, TwoSided) else model
+    dataset = of_channels(Dataset.of(dataset), made.names, made.units)
+    return made.transforms.apply(dataset)
+
+
+def _scored(
+    name: str,
+    model: BaseModel | Blend,
+    dataset: Dataset,
+    counted: Sequence[NDArray[np.bool_]],
+    *,
+    seed: int = 0,
+) -> ChannelScores:
+    """Scores causal predictions of a data set that is transformed and in the model's order."""
+    answers: list[Answer] | None = None
+    every: dict[str, list[NDArray[np.float64]]] = {}
+    if isinstance(model, Blend):
+        answers = model.causal(dataset, seed=seed)
+        every["blend"] = [a.values for a in answers]
+        rows = model_rows(model.forward, dataset, seed=seed)
+        if rows is not None and model.forward is not None:
+            every[f"{model.forward.name} alone"] = rows
+        baselines = {n: m.predict(dataset) for n, m in model.stack.members.items()}
+    else:
+        rows = model_rows(model, dataset, seed=seed)
+        assert rows is not None
+        every[model.name] = rows
+        mean = training_mean(model)
+        baselines = {n: [fill(t, n, mean) for t in dataset] for n in forecasters()}
+    every |= baselines
+    sums = _sums_for(model)
+    for i, trajectory in enumerate(dataset):
+        each = {n: values[i] for n, values in every.items()}
+        sums.add(np.nan_to_num(trajectory.values), each, counted[i])
+        if answers is not None:
+            sums.add_intervals(trajectory.values, answers[i], counted[i])
+    return sums.scores(name, tuple(baselines))
+
+
+def _fills(
+    model: BaseModel | Blend | TwoSided, dataset: Dataset, mode: str, seed: int
+) -> tuple[_Predictions, list[Answer] | None, tuple[str, ...]]:
+    """Fills of each predictor, answers with intervals, and which predictors are baselines."""
+    if isinstance(model, Blend):
+        ask = model.causal if mode == "causal" else model.fill
+        members: Mapping[str, Baseline] = (
+            model.stack.members if mode == "causal" else model.both.members
+        )
+        answers = ask(dataset, seed=seed)
+        every = {"blend": [a.values for a in answers]}
+        rows = (
+            model_rows(model.forward, dataset, seed=seed)
+            if mode == "causal"
+            else model_fills(model.forward, model.backward, dataset, seed=seed)
+        )
+        if rows is not None and model.forward is not None:
+            every[f"{model.forward.name} alone"] = rows
+        return (
+            {**every, **{n: m.predict(dataset) for n, m in members.items()}},
+            answers,
+            tuple(members),
+        )
+    forward = model.forward if isinstance(model, TwoSided) else model
+    result = {"causal": [t.values for t in impute(forward, dataset, seed=seed)]}
+    if isinstance(model, TwoSided):
+        result["two_sided"] = [t.values for t in impute(model, dataset, seed=seed)]
+    mean = training_mean(forward)
+    for method in fillers():
+        result[method] = [fill(t, method, mean) for t in dataset]
+    return result, None, fillers()
+
+
 def training_mean(model: BaseModel) -> list[float]:
     """The mean of each channel over the observed values of the training set, in its unit."""
     mean: list[float] = model.scaler.original(np.array(model.statistics.mean)).tolist()
     return mean
 
 
-def _sums_for(model: BaseModel) -> ErrorSums:
-    scale = np.abs(model.scaler.scale) * np.array(model.statistics.std)
-    return ErrorSums(model.names, model.units, scale)
+def _sums_for(model: BaseModel | Blend | TwoSided) -> ErrorSums:
+    made = model.forward if isinstance(model, TwoSided) else model
+    return ErrorSums(made.names, made.units, channel_scale(made))
+
+
+def channel_scale(model: BaseModel | Blend) -> NDArray[np.float64]:
+    """(channels,) standard deviation of the training data, in the unit of each channel."""
+    own = model.forward if isinstance(model, Blend) else model
+    if own is None:
+        assert isinstance(model, Blend)
+        return model.stack.scale
+    return np.asarray(np.abs(own.scaler.scale) * np.array(own.statistics.std))
 
 
 def _gap_lengths(trajectory: Trajectory) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from offbeat.baselines.base import (
     BASELINES,
     Array,
+    Baseline,
     CausalBaseline,
     State,
     fit_baseline,
@@ -238,9 +239,7 @@ class Stack(CausalBaseline):
             "edges": self.keys.bins.edges,
         }
         nested = {f"local.{k}": v for k, v in self.keys.local.arrays().items()}
-        for name, member in self.members.items():
-            nested |= {f"member.{name}.{k}": v for k, v in member.arrays().items()}
-        return {**own, **nested}
+        return {**own, **nested, **arrays_of(self.members)}
 
     def restore(self, arrays: Mapping[str, Array]) -> Stack:
         """See `Baseline`."""
@@ -248,12 +247,36 @@ class Stack(CausalBaseline):
         edges = own.pop("edges")
         super().restore(own)
         self.keys = Keys(AgeBins(edges), LocalScale().restore(within(arrays, "local.")))
-        self.members = {}
-        for name in dict.fromkeys(k.split(".")[1] for k in arrays if k.startswith("member.")):
-            member = BASELINES[name]().restore(within(arrays, f"member.{name}."))
-            assert isinstance(member, CausalBaseline)
-            self.members[name] = member
+        self.members = {
+            n: m for n, m in members_of(arrays).items() if isinstance(m, CausalBaseline)
+        }
         return self
+
+
+def arrays_of(members: Mapping[str, Baseline]) -> dict[str, Array]:
+    """The arrays of fitted baselines, with names that keep their order.
+
+    Args:
+        members: by name.
+    """
+    return {
+        f"member.{i:03d}.{name}.{k}": v
+        for i, (name, member) in enumerate(members.items())
+        for k, v in member.arrays().items()
+    }
+
+
+def members_of(arrays: Mapping[str, Array]) -> dict[str, Baseline]:
+    """The inverse of `arrays_of`; other arrays are ignored.
+
+    Args:
+        arrays: in any order.
+    """
+    heads = sorted({".".join(k.split(".")[:3]) for k in arrays if k.startswith("member.")})
+    return {
+        head.split(".")[2]: BASELINES[head.split(".")[2]]().restore(within(arrays, f"{head}."))
+        for head in heads
+    }
 
 
 def within(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:

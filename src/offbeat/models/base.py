@@ -112,16 +112,7 @@ class BaseModel(nn.Module):
         Raises:
             InputError: channels differ from the model's, or their units where the data has any.
         """
-        dataset = dataset.without_actions_but(self.names)
-        own = dict(zip(self.names, self.units, strict=True))
-        given = dict(zip(dataset.names, dataset.units, strict=True))
-        agree = own.keys() == given.keys() and all(
-            unit in ("", own[name]) or not own[name] for name, unit in given.items()
-        )
-        if not agree:
-            raise InputError(f"the model was made for other channels: {_difference(own, given)}")
-        if dataset.names != self.names:
-            dataset = dataset.select(self.names)
+        dataset = of_channels(dataset, self.names, self.units)
         dataset = self.transforms.apply(dataset)
         batch = Batch.of(dataset, scaler=self.scaler, dtype=self.dtype, roles=self.roles)
         return batch.to(self.device)
@@ -168,6 +159,30 @@ class BaseModel(nn.Module):
         from offbeat.models.checkpoint import save_model
 
         save_model(self, path)
+
+
+def of_channels(dataset: Dataset, names: tuple[str, ...], units: tuple[str, ...]) -> Dataset:
+    """A data set with the channels that a model was made for, in their order.
+
+    Actions that are not among them are left out.
+
+    Args:
+        dataset: given.
+        names: of the model's channels.
+        units: of the model's channels.
+
+    Raises:
+        InputError: channels differ, or their units where the data has any.
+    """
+    dataset = dataset.without_actions_but(names)
+    own = dict(zip(names, units, strict=True))
+    given = dict(zip(dataset.names, dataset.units, strict=True))
+    agree = own.keys() == given.keys() and all(
+        unit in ("", own[name]) or not own[name] for name, unit in given.items()
+    )
+    if not agree:
+        raise InputError(f"the model was made for other channels: {_difference(own, given)}")
+    return dataset if dataset.names == names else dataset.select(names)
 
 
 def _difference(own: dict[str, str], given: dict[str, str]) -> str:
