@@ -27,6 +27,8 @@ STAGES = (
     "models",
     "metrics",
     "baselines",
+    "correction",
+    "examples",
     "run",
     "training",
     "answers",

@@ -255,7 +255,7 @@ def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkp
 
     monkeypatch.setattr(training, "train_step", poisoned)
     model = ob.make_model("gru", TRAIN, **SMALL)
-    config = ob.TrainConfig(epochs=5, batch_size=4)
+    config = ob.TrainConfig(epochs=5, batch_size=4, keep="last")
     with pytest.raises(ob.DivergenceError, match=r"nan in epoch 3, step 2.*last good checkpoint"):
         ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     kept = sorted((tmp_path / "checkpoints").iterdir())
@@ -264,6 +264,88 @@ def test_a_loss_that_turns_to_nan_names_epoch_and_step_and_keeps_the_last_checkp
     again = ob.make_model("gru", TRAIN, **SMALL)
     ob.fit(again, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
     assert all(bool(torch.isfinite(p).all()) for p in again.parameters())
+
+
+def poisoned_at(monkeypatch, *steps_with_nan):
+    """Makes the weights NaN after some training steps; returns the steps' learning rates."""
+    import offbeat.training as training
+
+    rates, step = [], training.train_step
+
+    def poisoned(model, examples, index, state, *args, **kwargs):
+        loss = step(model, examples, index, state, *args, **kwargs)
+        rates.append(state.optimizer.param_groups[0]["lr"])
+        if len(rates) in steps_with_nan:
+            with torch.no_grad():
+                next(model.parameters()).fill_(float("nan"))
+        return loss
+
+    monkeypatch.setattr(training, "train_step", poisoned)
+    return rates
+
+
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_after_a_divergence_the_best_weights_are_trained_on_at_half_the_rate(
+    schedule, monkeypatch, tmp_path
+):
+    config = ob.TrainConfig(epochs=4, batch_size=4, schedule=schedule)
+    planned = ob.make_model("gru", TRAIN, **SMALL)
+    rates = poisoned_at(monkeypatch)
+    ob.fit(planned, TRAIN, VALIDATION, config, progress=False)
+    monkeypatch.undo()
+    halved = poisoned_at(monkeypatch, 7)  # three steps make an epoch
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    result = ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
+    assert [record.epoch for record in result.history] == [1, 2, 3, 4]
+    assert result.diverged == ""
+    # The seventh step poisons, the loss of the eighth is NaN, and the third epoch starts anew.
+    assert halved[:7] == rates[:7]
+    assert halved[7:] == [rate / 2 for rate in rates[6:]]
+    again = ob.make_model("gru", TRAIN, **SMALL)
+    ob.fit(again, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
+    assert same(weights(again), weights(model))
+
+
+def test_a_training_that_diverges_twice_ends_with_its_best_weights_and_says_so(
+    monkeypatch, tmp_path
+):
+    kept = []
+    config = ob.TrainConfig(epochs=5, batch_size=4)
+    poisoned_at(monkeypatch, 7, 9)
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    result = ob.fit(
+        model, TRAIN, VALIDATION, config, out=tmp_path, progress=False,
+        callbacks=[lambda record, model: kept.append(weights(model))],
+    )  # fmt: skip
+    assert "diverged twice (epoch 3)" in result.diverged
+    assert result.stopped_early
+    assert len(kept) == 2
+    assert same(weights(model), kept[result.best_epoch - 1])
+    assert same(weights(ob.load_model(tmp_path)), weights(model))
+    monkeypatch.undo()
+    again = ob.make_model("gru", TRAIN, **SMALL)
+    assert ob.fit(again, TRAIN, VALIDATION, config, out=tmp_path, progress=False).diverged
+    assert same(weights(again), weights(model))
+
+
+def test_two_trainings_in_one_folder_at_once_end_in_one_line_and_a_dead_one_holds_no_lock(tmp_path):
+    config = ob.TrainConfig(epochs=1, batch_size=4)
+    script = (
+        "import sys, time; from pathlib import Path; from offbeat.run import locked\n"
+        "with locked(Path(sys.argv[1])): print('locked', flush=True); time.sleep(60)"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert other.stdout.readline() == "locked\n"
+        model = ob.make_model("gru", TRAIN, **SMALL)
+        with pytest.raises(ob.InputError, match=f"process {other.pid} trains there; wait"):
+            ob.fit(model, TRAIN, config=config, out=tmp_path, progress=False)
+    finally:
+        other.kill()
+        other.communicate()
+    assert ob.fit(model, TRAIN, config=config, out=tmp_path, progress=False).steps == 3
 
 
 def test_a_learning_rate_that_explodes_is_reported_as_a_divergence():

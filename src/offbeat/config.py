@@ -236,12 +236,53 @@ class SplitConfig:
         }
 
 
+LOSSES = ("head", "relative")
+"""Losses of `TrainConfig.loss`."""
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """How tasks are drawn; see `offbeat.data.tasks.draw_tasks`.
+
+    Attributes:
+        horizon_s: s, longest time after the last observation that is asked for.
+        gap_s: s, typical time between rows: the shortest one.
+        window_s: s, length of a window; by default four horizons, at least 64 typical gaps.
+        sensors: names of the channels of each sensor; by default as `sensors_of` finds.
+        shares: fraction of each kind of task; by default those of predictions from the past.
+    """
+
+    horizon_s: float
+    gap_s: float
+    window_s: float | None = None
+    sensors: tuple[tuple[str, ...], ...] | None = None
+    shares: dict[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.sensors is not None:
+            object.__setattr__(self, "sensors", tuple(tuple(names) for names in self.sensors))
+        for name in ("horizon_s", "gap_s", "window_s"):
+            _check(self, name, lambda v: 0 < v < math.inf, "a positive number of seconds")
+        shares = self.shares or {}
+        if any(not share >= 0 for share in shares.values()) or (
+            self.shares is not None and not math.isclose(sum(shares.values()), 1, abs_tol=1e-6)
+        ):
+            raise InputError(f"shares of tasks must be fractions that sum to 1, got {self.shares}")
+
+    @property
+    def length_s(self) -> float:
+        """s, length of a window."""
+        if self.window_s is not None:
+            return self.window_s
+        return max(4 * self.horizon_s, 64 * self.gap_s)
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Options of a training. A field that is None takes the value of the model's recipe.
 
     Attributes:
-        epochs: passes over the training trajectories.
+        epochs: passes over the training trajectories, or over `tasks_per_epoch` tasks.
         batch_size: trajectories per step.
         optimizer: `adamax`, `adam`, `adamw` or `sgd`.
         learning_rate: of the optimizer, at the start.
@@ -256,6 +297,13 @@ class TrainConfig:
             validation MSE; by default the best where there is a validation set.
         checkpoint_every: steps between checkpoints inside an epoch; None writes one at the end
             of each epoch only.
+        tasks: train on tasks that are drawn anew from the trajectories in each epoch, and validate
+            on a fixed set of them; None trains on the trajectories and their masks as they are.
+        tasks_per_epoch: number of tasks of an epoch.
+        loss: `head`, that of the model's head in scaled units; or `relative`, errors in units of
+            those of the best baseline for the channel and the time since its last observation.
+            With it, or with tasks, `patience` and `keep` go by the validation score, the mean
+            logarithm of the ratio of the MSE to that of the best baseline.
     """
 
     epochs: int | None = None
@@ -269,17 +317,23 @@ class TrainConfig:
     patience: int | None = None
     keep: Literal["last", "best"] | None = None
     checkpoint_every: int | None = None
+    tasks: TaskConfig | None = None
+    tasks_per_epoch: int | None = None
+    loss: Literal["head", "relative"] | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.tasks, dict):  # from JSON and YAML
+            object.__setattr__(self, "tasks", from_mapping(TaskConfig, self.tasks))
         for name, choices in (
             ("optimizer", ("adamax", "adam", "adamw", "sgd")),
             ("schedule", ("constant", "cosine")),
             ("keep", ("last", "best")),
+            ("loss", LOSSES),
         ):
             if getattr(self, name) is not None:
                 one_of(f"value of {name}", getattr(self, name), choices)
         check_seed(self.seed)
-        for name in ("epochs", "batch_size", "patience", "checkpoint_every"):
+        for name in ("epochs", "batch_size", "patience", "checkpoint_every", "tasks_per_epoch"):
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
         for name in ("learning_rate", "loss_scale"):
             _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
@@ -302,6 +356,9 @@ class Recipe:
         seed: of the order of the batches and of self-feeding.
         patience: epochs without improvement; None never stops early.
         checkpoint_every: steps; None writes a checkpoint per epoch.
+        tasks: how tasks are drawn; None trains on the trajectories as they are.
+        tasks_per_epoch: number of tasks.
+        loss: `head` or `relative`.
     """
 
     epochs: int
@@ -315,6 +372,14 @@ class Recipe:
     seed: int = 0
     patience: int | None = None
     checkpoint_every: int | None = None
+    tasks: TaskConfig | None = None
+    tasks_per_epoch: int = 1024
+    loss: str = "head"
+
+    @property
+    def relative(self) -> bool:
+        """Whether the validation score is relative to the best baseline."""
+        return self.tasks is not None or self.loss == "relative"
 
 
 def check_seed(seed: int) -> int:

@@ -7,13 +7,15 @@ import hashlib
 import io
 import json
 import math
+import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,12 +36,15 @@ class EpochRecord:
     Attributes:
         epoch: counted from 1.
         steps: optimizer steps so far.
-        train_mse: mean over the epoch's batches, scaled units, rows after the first.
+        train_mse: mean of the loss over the epoch's batches: by default the MSE in scaled units,
+            rows after the first.
         validation_mse: NaN without a validation part.
         validation_after_first_row_mse: the same, all rows but the first.
         validation_published_mse: the same, the thesis' scoring.
         learning_rate: at the end of the epoch.
         seconds: wall time of the epoch.
+        validation_score: mean logarithm of the ratio of the MSE to that of the best baseline, see
+            `ErrorTable.relative`; NaN without tasks or a relative loss.
     """
 
     epoch: int
@@ -50,6 +55,7 @@ class EpochRecord:
     validation_published_mse: float
     learning_rate: float
     seconds: float
+    validation_score: float = math.nan
 
 
 class FlatParameters:
@@ -114,8 +120,10 @@ class RunState:
         self.loss_sum = 0.0
         self.seconds = 0.0
         self.history: list[EpochRecord] = []
-        self.best_mse = math.inf
+        self.best_mse = math.inf  # or score, where there is one
         self.best_epoch = 0
+        self.rate_factor = 1.0  # of the learning rate; smaller after a divergence
+        self.diverged = ""  # what happened, where a training ended so
         self.best: dict[str, Tensor] = {}
 
 
@@ -132,8 +140,50 @@ def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimize
     return optimizer
 
 
+LOCK = ".lock"
+"""File in a run's folder with the id of the process that trains there."""
+
+LADDER = "ladder"
+"""Subfolder of the trainings from which `fit_ladder` chooses."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Locks the folder of a run for this process, for as long as the block runs.
+
+    The lock of a process that has ended, however it ended, is void.
+
+    Args:
+        folder: of the run; made if it is missing.
+
+    Raises:
+        InputError: another training uses it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("a+", encoding="utf-8") as file:
+        if os.name == "posix":
+            import fcntl
+
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                file.seek(0)
+                raise InputError(
+                    f"{folder} is in use: process {file.read().strip() or '?'} trains there; wait "
+                    "until it ends, or give another folder"
+                ) from None
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield
+
+
 def identity_of(
-    model: BaseModel, recipe: Recipe, train: Dataset, validation: Dataset | None
+    model: BaseModel,
+    recipe: Recipe,
+    train: Dataset,
+    validation: Dataset | None,
+    **others: Sequence[Any],
 ) -> dict[str, Any]:
     """The identity of a run, which must be equal to resume it.
 
@@ -142,6 +192,7 @@ def identity_of(
         recipe: of the training.
         train: the training set.
         validation: the validation set, or None.
+        **others: predictors that the training was given: a base, or baselines.
     """
     weights = hashlib.sha256()
     for value in model.state_dict().values():
@@ -163,9 +214,24 @@ def identity_of(
     }
     if recipe.schedule == "constant":
         identity["training"].pop("epochs")  # such a run can be trained for longer
+    if recipe.tasks is None:  # as in runs of versions that had no tasks
+        for name in ("tasks", "tasks_per_epoch"):
+            identity["training"].pop(name)
+    if recipe.loss == "head":
+        identity["training"].pop("loss")
+    for name, predictors in others.items():
+        identity[name] = [_predictor(each) for each in predictors]
     # lists in place of tuples, as in the file
     plain: dict[str, Any] = json.loads(json.dumps(identity))
     return plain
+
+
+def _predictor(predictor: Any) -> dict[str, Any]:
+    """The identity of a fitted predictor: its class, and its arrays where it has any."""
+    digest = hashlib.sha256()
+    for name, array in getattr(predictor, "arrays", dict)().items():
+        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return {"kind": type(predictor).__name__, "arrays": digest.hexdigest()}
 
 
 def _part(dataset: Dataset) -> dict[str, Any]:
@@ -187,6 +253,8 @@ _WORDS = {
     "initial_weights": "the initial weights",
     "train": "the trajectories of the training set",
     "validation": "the trajectories of the validation set",
+    "base": "the predictor that is corrected",
+    "baselines": "the baselines",
 }
 """Names of the parts of an identity in messages."""
 
@@ -212,6 +280,8 @@ def save_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str
         "seconds": state.seconds,
         "best_mse": state.best_mse if math.isfinite(state.best_mse) else None,
         "best_epoch": state.best_epoch,
+        "rate_factor": state.rate_factor,
+        "diverged": state.diverged,
         "history": [
             {k: None if v != v else v for k, v in asdict(epoch).items()} for epoch in state.history
         ],
@@ -243,7 +313,7 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
     checkpoints = sorted((folder / "checkpoints").glob("steps-*"))
     if not checkpoints:
         others = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if others - {"tensorboard", "checkpoints"}:
+        if others - {"tensorboard", "checkpoints", LOCK, LADDER}:
             raise InputError(
                 f"{folder} is not empty and holds no run ({', '.join(sorted(others)[:3])}, ...); "
                 "give a new folder"
@@ -255,8 +325,8 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
             f"{folder} holds a run of Offbeat 0.1, whose checkpoints do not say on which data; its "
             "model can be used, but the run can't be resumed: give another folder"
         )
-    for part, now in identity.items():
-        then = kept["identity"].get(part)
+    for part in _WORDS:
+        then, now = kept["identity"].get(part), identity.get(part)
         if then != now:
             raise InputError(
                 f"{folder} holds another run: {_WORDS[part]} differ{_difference(then, now)}; give "
@@ -276,6 +346,8 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
     state.best = {k[len("best.") :]: v for k, v in tensors.items() if k.startswith("best.")}
     for name in ("epoch", "step", "total_steps", "loss_sum", "seconds", "best_epoch"):
         setattr(state, name, kept[name])
+    state.rate_factor = kept.get("rate_factor", 1.0)
+    state.diverged = kept.get("diverged", "")
     state.best_mse = math.inf if kept["best_mse"] is None else kept["best_mse"]
     for record in kept["history"]:
         fields_: dict[str, Any] = {k: math.nan if v is None else v for k, v in record.items()}

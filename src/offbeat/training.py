@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +15,38 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from offbeat.baselines import AgeBins
 from offbeat.config import Recipe, TrainConfig
-from offbeat.data.batch import Batch
+from offbeat.correction import Base, Correction, start_at_base
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
+from offbeat.examples import (
+    Examples,
+    Reference,
+    TrainingSet,
+    ValidationSet,
+    expect_silences,
+    fitted_baselines,
+    ordered,
+    reference_tasks,
+    validate,
+)
 from offbeat.files import writable
-from offbeat.metrics import Scores, ScoreSums
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import save_model
 from offbeat.models.zoo import recipe_of
-from offbeat.parts.heads import Prediction
 from offbeat.run import (
     EpochRecord,
     RunState,
     flat_parameters,
     identity_of,
+    locked,
     resume_run,
     save_run,
     write_log,
 )
+
+__all__ = ["Callback", "Examples", "FitResult", "ValidationSet", "fit", "train_step", "validate"]
 
 Callback = Callable[[EpochRecord, BaseModel], bool | None]
 """Called after each epoch; a true result stops the training."""
@@ -48,12 +61,25 @@ class FitResult:
         stopped_early: True if `patience` or a callback ended the training.
         folder: of log and checkpoints, or None.
         recipe: training configuration that was used.
+        best_epoch: of the lowest validation error; 0 if none was better than any other.
+        correction: the base that the model corrects, and its scale; None without a base.
+        diverged: what happened, where the training diverged and ended with its best weights; else
+            empty.
     """
 
     history: tuple[EpochRecord, ...]
     stopped_early: bool
     folder: Path | None
     recipe: Recipe
+    best_epoch: int = 0
+    correction: Correction | None = None
+    diverged: str = ""
+
+    @property
+    def validation_score(self) -> float:
+        """The best validation score; NaN if there is none."""
+        scores = [r.validation_score for r in self.history if not math.isnan(r.validation_score)]
+        return min(scores, default=math.nan)
 
     @property
     def steps(self) -> int:
@@ -68,22 +94,35 @@ def fit(
     config: TrainConfig | None = None,
     *,
     out: str | Path | None = None,
+    base: Base | None = None,
+    baselines: Sequence[Base] | None = None,
     device: str | torch.device | None = None,
     callbacks: Sequence[Callback] = (),
     progress: bool = True,
 ) -> FitResult:
-    """Trains a model in place on one-step-ahead prediction.
+    """Trains a model in place on one-step-ahead prediction, or on tasks.
 
-    The loss is that of the model's head over the known values of all rows but the first, in scaled
-    units. Batches, their order and all random numbers depend only on `config.seed`.
+    By default the loss is that of the model's head over the known values of all rows but the first,
+    in scaled units. With `config.tasks`, each epoch draws windows and masks anew (see `draw_tasks`)
+    and the loss is relative: the error of each value is divided by that of the best baseline for
+    its channel and its time since observation. Batches, their order and all random numbers depend
+    only on `config.seed`.
+
+    Where the loss or a weight turns infinite or NaN and the best weights are kept, the training
+    resumes from these, once, at half the learning rate, and ends with them if it diverges again.
 
     Args:
         model: trained in place.
-        train: the training set; masked values that are known serve as targets.
-        validation: scored after each epoch.
+        train: the training set; masked values that are known serve as targets. With tasks, whole
+            trajectories.
+        validation: scored after each epoch; with tasks, on tasks that are drawn from it once.
         config: fields that are None, or all of them if it is None, follow the model's recipe.
         out: folder for `log.csv`, checkpoints and the final `model`; a run that was stopped there
             is resumed, and ends bit for bit as if it had not been stopped.
+        base: a predictor, such as a fitted causal baseline; the model is then trained to correct
+            it, and `FitResult.correction` predicts with both.
+        baselines: fitted to training data; the best of their errors are the units of the relative
+            loss and score. By default all causal ones are fitted to tasks.
         device: such as `cpu` or `cuda`; by default that of the model. The model stays on it.
         callbacks: each is called with the record of an epoch and the model after that epoch; a true
             result stops the training.
@@ -94,8 +133,10 @@ def fit(
 
     Raises:
         InputError: data of other channels than the model, no validation set although `patience` or
-            `keep="best"` needs one, or `out` holds another run.
-        DivergenceError: the loss is no longer finite; the last good checkpoint is kept.
+            `keep="best"` needs one, a model that cannot correct a base, or `out` holds another run
+            or is used by one.
+        DivergenceError: the loss is no longer finite and no best weights are kept; the last good
+            checkpoint is.
     """
     train = Dataset.of(train)
     validation = None if validation is None else Dataset.of(validation)
@@ -105,10 +146,22 @@ def fit(
     folder = writable(out, folder=True) if out is not None else None
     if device is not None:
         model.to(_device(device))
-    batch = model.batch(train)
+    if asked.tasks is not None:
+        expect_silences(model, asked.tasks.horizon_s)
+    if base is not None:
+        start_at_base(model)
+    trained_on = ordered(model, train)
+    recipe = recipe_of(model.name, asked, validated=validation is not None)
+    reference, correction = _predictors(model, trained_on, recipe, base, baselines)
     validated = None
     if validation is not None:
-        validated = ValidationSet(model, model.batch(validation))
+        validated = ValidationSet.of(
+            model,
+            ordered(model, validation),
+            recipe,
+            reference=reference,
+            correction=correction,
+        )
     counts = validated is not None and validated.counted > 0
     recipe = recipe_of(model.name, asked, validated=counts)
     if not counts and (recipe.patience is not None or recipe.keep == "best"):
@@ -118,18 +171,58 @@ def fit(
             "no value of the validation set counts: none is known after its channel's first "
             "observation; give a longer validation set, or keep='last' and no patience"
         )
-    with flat_parameters(model) as parameters, model.threads():
+    with ExitStack() as stack:
+        if folder is not None:
+            stack.enter_context(locked(folder))
+        examples = stack.enter_context(
+            closing(
+                TrainingSet(
+                    model,
+                    trained_on,
+                    recipe,
+                    reference=reference if recipe.loss == "relative" else None,
+                    correction=correction,
+                )
+            )
+        )
+        parameters = stack.enter_context(flat_parameters(model))
+        stack.enter_context(model.threads())
         state = RunState(parameters, recipe)
         identity: dict[str, Any] = {}
         if folder is not None:
-            identity = identity_of(model, recipe, train, validation)
+            others = {"base": [base] if base is not None else [], "baselines": baselines or []}
+            given = {name: each for name, each in others.items() if each}
+            identity = identity_of(model, recipe, train, validation, **given)
             resume_run(folder, model, state, identity)
             if state.epoch > recipe.epochs:
                 raise InputError(
                     f"{folder} holds a run of {state.epoch} epochs already, {recipe.epochs} were "
                     "requested; give another folder"
                 )
-        return _fit(model, batch, validated, recipe, state, folder, identity, callbacks, progress)
+        run = (recipe, state, folder, identity, callbacks, progress)
+        result = _fit(model, examples, validated, *run)
+    return replace(result, correction=correction)
+
+
+def _predictors(
+    model: BaseModel,
+    train: Dataset,
+    recipe: Recipe,
+    base: Base | None,
+    baselines: Sequence[Base] | None,
+) -> tuple[Reference | None, Correction | None]:
+    """The baselines that errors are compared with, and the base that is corrected."""
+    if base is None and not recipe.relative:
+        return None, None
+    fitted_to, measured_on = reference_tasks(train, recipe)
+    correction = None
+    if base is not None:
+        correction = Correction.of(base, model, measured_on, AgeBins.of(measured_on))
+    reference = None
+    if recipe.relative:
+        given = fitted_baselines(fitted_to) if baselines is None else baselines
+        reference = Reference.of(given, model, measured_on)
+    return reference, correction
 
 
 def _device(name: str | torch.device) -> torch.device:
@@ -144,7 +237,7 @@ def _device(name: str | torch.device) -> torch.device:
 
 def _fit(
     model: BaseModel,
-    batch: Batch,
+    training_set: TrainingSet,
     validated: ValidationSet | None,
     recipe: Recipe,
     state: RunState,
@@ -153,13 +246,19 @@ def _fit(
     callbacks: Sequence[Callback],
     progress: bool,
 ) -> FitResult:
-    examples = Examples(model, batch)
     stopped = _stopped(state, recipe)
     writer = _tensorboard(folder, state)
-    with _progress_bar(state, recipe, len(batch), progress) as bar:
+    with _progress_bar(state, recipe, len(training_set), progress) as bar:
         while state.epoch < recipe.epochs and not stopped:
-            _epoch(model, examples, state, recipe, bar, folder, identity)
-            _close_epoch(model, validated, state, recipe)
+            try:
+                examples = training_set.epoch(state.epoch)
+                _epoch(model, examples, state, recipe, bar, folder, identity)
+                _close_epoch(model, validated, state, recipe)
+            except DivergenceError as error:
+                stopped = _recover(model, state, recipe, error)
+                if folder is not None:
+                    save_run(folder, model, state, identity)
+                continue
             record = state.history[-1]
             bar.set_postfix_str(_postfix(record))
             for name, value in asdict(record).items() if writer else ():
@@ -177,104 +276,35 @@ def _fit(
     if folder is not None:
         save_model(model, folder / "model")
     early = stopped and state.epoch < recipe.epochs
-    return FitResult(tuple(state.history), early, folder, recipe)
+    return FitResult(
+        tuple(state.history), early, folder, recipe, state.best_epoch, diverged=state.diverged
+    )
 
 
-class ValidationSet:
-    """A data set that is scored repeatedly; its step inputs are computed once.
+def _recover(model: BaseModel, state: RunState, recipe: Recipe, error: DivergenceError) -> bool:
+    """Restores the best weights after a divergence; True if it was the second one.
 
-    Args:
-        model: its scales and statistics give the step inputs.
-        batch: scaled by the model's scaler.
-        size: trajectories at a time.
+    Raises:
+        DivergenceError: no best weights are kept.
     """
-
-    def __init__(self, model: BaseModel, batch: Batch, *, size: int = 500) -> None:
-        self.channels = batch.channels
-        with torch.no_grad():
-            parts = (batch.take(slice(i, i + size)) for i in range(0, len(batch), size))
-            self.parts = [(_whole(model.prepare(part)), part) for part in parts]
-        empty = ScoreSums(self.channels)
-        for _, part in self.parts:
-            empty.add(part.values, part)
-        self.counted = empty.scores().after_first_observation.count
-
-    def scores(self, model: BaseModel, *, seed: int = 0, gap_unit: float | None = None) -> Scores:
-        """Scores a model in its current state.
-
-        Args:
-            model: to score.
-            seed: of self-feeding.
-            gap_unit: s; groups the score by time since observation, as `ScoreSums` does.
-        """
-        sums = ScoreSums(self.channels, gap_unit=gap_unit)
-        with torch.inference_mode():
-            for prepared, part in self.parts:
-                # One generator for all parts, as if they were one batch.
-                generator = torch.Generator().manual_seed(seed) if model.needs_generator else None
-                sums.add(model.run(prepared, generator=generator).mean, part)
-        return sums.scores()
-
-
-def _whole(prepared: Any) -> Any:
-    return prepared.take(torch.arange(len(prepared)))
-
-
-def validate(model: BaseModel, batch: Batch, *, seed: int = 0, size: int = 500) -> Scores:
-    """Scores a model on a scaled batch, in parts.
-
-    Args:
-        model: to score.
-        batch: scaled by the model's scaler.
-        seed: of self-feeding.
-        size: trajectories at a time.
-    """
-    validated = ValidationSet(model, batch, size=size)
-    return validated.scores(model, seed=seed, gap_unit=model.statistics.median_gap)
+    if not state.best:
+        raise error
+    model.load_state_dict(state.best)
+    state.optimizer.state.clear()
+    state.total_steps -= state.step
+    state.step, state.loss_sum, state.seconds = 0, 0.0, 0.0
+    if state.rate_factor < 1:
+        state.diverged = (
+            f"the training diverged twice (epoch {state.epoch + 1}), also at half the learning "
+            f"rate; it ends with the weights of epoch {state.best_epoch}, the best ones on the "
+            "validation set: lower the learning rate, or clip gradients (clip_norm)"
+        )
+        return True
+    state.rate_factor = 0.5
+    return False
 
 
 # --- one epoch ------------------------------------------------------------------------------------
-
-
-class Examples:
-    """A training set in memory, with inputs that are computed once for all epochs.
-
-    Args:
-        model: its scales and statistics give the step inputs.
-        batch: scaled.
-    """
-
-    def __init__(self, model: BaseModel, batch: Batch) -> None:
-        with torch.no_grad():
-            self.prepared = model.prepare(batch)
-        # Without the first row: its prediction is a constant.
-        self.targets = batch.values[:, 1:].contiguous()
-        counted = batch.targets[:, 1:]
-        self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
-
-    def __len__(self) -> int:
-        return len(self.prepared)
-
-    def loss(self, model: BaseModel, index: Tensor, generator: torch.Generator | None) -> Tensor:
-        """The model's loss of the one-step-ahead prediction of some trajectories.
-
-        Args:
-            model: in its current state.
-            index: (batch,) positions of the trajectories.
-            generator: of self-feeding.
-        """
-        index = index.to(self.targets.device)
-        whole = model.run(self.prepared.take(index), generator=generator)
-        scale = None if whole.scale is None else whole.scale[:, 1:]
-        prediction = Prediction(whole.mean[:, 1:], scale)
-        rows = prediction.mean.shape[1]
-        targets = self.targets.index_select(0, index)[:, :rows]
-        mask = None
-        if self.counted is not None:
-            mask = self.counted.index_select(0, index)[:, :rows]
-        elif not rows:
-            mask = torch.ones_like(targets)
-        return model.loss(prediction, targets, mask)
 
 
 def _epoch(
@@ -349,7 +379,10 @@ def train_step(
     if recipe.schedule == "cosine":
         rate = 0.5 * recipe.learning_rate * (1 + math.cos(math.pi * state.total_steps / total))
         for group in state.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = state.rate_factor * rate
+    elif state.rate_factor < 1:
+        for group in state.optimizer.param_groups:
+            group["lr"] = state.rate_factor * recipe.learning_rate
     state.optimizer.step()
     return value
 
@@ -361,7 +394,8 @@ def _close_epoch(
     recipe: Recipe,
 ) -> None:
     _check_weights(model, state)
-    scores = validated.scores(model, seed=recipe.seed) if validated is not None else None
+    found = validated.judge(model, seed=recipe.seed) if validated is not None else None
+    scores = found.scores if found is not None else None
     if (
         scores is not None
         and not math.isfinite(scores.after_first_row.mse)
@@ -382,10 +416,12 @@ def _close_epoch(
         validation_published_mse=scores.published.mse if scores else nan,
         learning_rate=float(state.optimizer.param_groups[0]["lr"]),
         seconds=state.seconds,
+        validation_score=found.relative if found else nan,
     )
     state.history.append(record)
-    if scores is not None and scores.after_first_observation.mse < state.best_mse:
-        state.best_mse, state.best_epoch = scores.after_first_observation.mse, record.epoch
+    error = record.validation_score if recipe.relative else record.validation_mse
+    if error < state.best_mse:
+        state.best_mse, state.best_epoch = error, record.epoch
         if recipe.keep == "best":
             state.best = {k: v.detach().clone() for k, v in model.state_dict().items()}
     state.epoch += 1
@@ -401,6 +437,8 @@ def _check_weights(model: BaseModel, state: RunState) -> None:
 
 
 def _stopped(state: RunState, recipe: Recipe) -> bool:
+    if state.diverged:
+        return True
     return recipe.patience is not None and state.epoch - state.best_epoch >= recipe.patience
 
 
@@ -435,6 +473,8 @@ def _progress_bar(state: RunState, recipe: Recipe, trajectories: int, show: bool
 
 
 def _postfix(record: EpochRecord) -> str:
+    if not math.isnan(record.validation_score):
+        return f"validation error / best baseline {math.exp(record.validation_score / 2):.3f}"
     if math.isnan(record.validation_mse):
         return f"train RMSE {record.train_mse**0.5:.4f}"
     return f"validation RMSE {record.validation_mse**0.5:.4f}"

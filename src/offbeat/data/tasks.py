@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.config import TaskConfig
 from offbeat.data.arrays import hand_over
 from offbeat.data.masking import sensors_of
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.errors import InputError, one_of
+from offbeat.errors import one_of
+
+__all__ = ["CAUSAL", "KINDS", "TWO_SIDED", "TaskConfig", "draw_tasks", "take_tasks"]
 
 KINDS = ("logged", "silence", "cut", "burst", "scattered")
 """Kinds of tasks, see `draw_tasks`."""
@@ -24,42 +26,12 @@ TWO_SIDED = {"silence": 0.5, "burst": 0.25, "scattered": 0.25}
 """Shares of the kinds for fills from both sides."""
 
 
-@dataclass(frozen=True)
-class TaskConfig:
-    """How tasks are drawn.
-
-    Attributes:
-        horizon_s: s, longest time after the last observation that is asked for.
-        gap_s: s, typical time between rows: the shortest one.
-        window_s: s, length of a window; by default four horizons, at least 64 typical gaps.
-        sensors: names of the channels of each sensor; by default as `sensors_of` finds.
-    """
-
-    horizon_s: float
-    gap_s: float
-    window_s: float | None = None
-    sensors: tuple[tuple[str, ...], ...] | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("horizon_s", "gap_s"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise InputError(f"{name} must be a positive number of seconds, got {value!r}")
-
-    @property
-    def length_s(self) -> float:
-        """s, length of a window."""
-        if self.window_s is not None:
-            return self.window_s
-        return max(4 * self.horizon_s, 64 * self.gap_s)
-
-
 def draw_tasks(
     dataset: Dataset,
     config: TaskConfig,
     count: int,
     *,
-    shares: dict[str, float] | None = None,
+    shares: Mapping[str, float] | None = None,
     seed: int | Sequence[int] = 0,
 ) -> Dataset:
     """Draws windows anywhere in a data set and hides observed values in them.
@@ -76,7 +48,7 @@ def draw_tasks(
         dataset: to draw from, trajectories by their number of rows.
         config: lengths.
         count: number of tasks.
-        shares: of each kind; by default `CAUSAL`.
+        shares: of each kind; by default those of `config`, else `CAUSAL`.
         seed: of everything that is drawn.
 
     Returns:
@@ -84,20 +56,30 @@ def draw_tasks(
         `meta["tasks"]` gives the kind and the source (trajectory, first row) of each.
     """
     random = np.random.default_rng(seed)
-    shares = shares or CAUSAL
+    shares = shares or config.shares or CAUSAL
     for kind in shares:
         one_of("kind of task", kind, KINDS)
     states = np.array([role == "state" for role in dataset.roles])
     sensors = _positions(dataset, config)
     weights = np.array([t.rows for t in dataset], dtype=np.float64)
     sources = random.choice(len(dataset), size=count, p=weights / weights.sum())
-    kinds = random.choice(list(shares), size=count, p=np.array(list(shares.values())))
+    fractions = np.array(list(shares.values()))
+    kinds = random.choice(list(shares), size=count, p=fractions / fractions.sum())
     tasks, notes = [], []
     for source, kind in zip(sources.tolist(), kinds.tolist(), strict=True):
         whole = dataset[source]
         start, stop = _window(whole, config.length_s, random)
-        task = _hidden(whole.slice(start, stop), kind, config, sensors, states, random)
-        tasks.append(task)
+        times, observed = whole.times[start:stop], whole.observed[start:stop].copy()
+        rows = _hide(times, observed, kind, config, sensors, states, random)
+        kept = slice(start, start + rows)
+        tasks.append(
+            replace(
+                whole,
+                times=whole.times[kept],
+                values=whole.values[kept],
+                observed=hand_over(observed)[:rows],
+            )
+        )
         notes.append([kind, source, start])
     return Dataset(tuple(tasks), {**dataset.meta, "tasks": notes})
 
@@ -115,27 +97,28 @@ def _window(t: Trajectory, length_s: float, random: np.random.Generator) -> tupl
     return start, max(stop, min(start + 2, t.rows))
 
 
-def _hidden(
-    task: Trajectory,
+def _hide(
+    times: NDArray[np.float64],
+    observed: NDArray[np.bool_],
     kind: str,
     config: TaskConfig,
     sensors: list[NDArray[np.int64]],
     states: NDArray[np.bool_],
     random: np.random.Generator,
-) -> Trajectory:
-    observed = task.observed.copy()
+) -> int:
+    """Hides values of a window in place; returns the number of its rows that the task has."""
+    rows = len(times)
     if kind == "cut":
-        length = _lengths(config, 1, random)[0]
-        latest = int(np.searchsorted(task.times, task.times[-1] - length, side="right"))
+        length = _length(config, random)
+        latest = int(np.searchsorted(times, times[-1] - length, side="right"))
         first = int(random.integers(1, max(latest, 2)))
-        stop = int(np.searchsorted(task.times, task.times[first - 1] + length, side="right"))
-        stop = max(stop, min(first + 1, task.rows))
+        stop = int(np.searchsorted(times, times[first - 1] + length, side="right"))
         observed[first:, states] = False
-        return replace(task, observed=hand_over(observed)).slice(0, stop)
+        return max(stop, min(first + 1, rows))
     if kind == "scattered":
         fraction = random.uniform(0.1, 0.7)
         together = random.random() < 0.5
-        draws = random.random((task.rows, 1 if together else task.channels)) < fraction
+        draws = random.random((rows, 1 if together else len(states))) < fraction
         observed &= ~(draws & states)
     if kind in ("silence", "burst"):
         groups = sensors if kind == "silence" else [np.flatnonzero(states)]
@@ -147,8 +130,8 @@ def _hidden(
             ]
         for group in groups:
             group = group[states[group]]
-            observed[np.ix_(_runs(task.times, config, random), group)] = False
-    return replace(task, observed=hand_over(observed))
+            observed[np.ix_(_runs(times, config, random), group)] = False
+    return rows
 
 
 def _runs(
@@ -158,17 +141,17 @@ def _runs(
     hidden = np.zeros(len(times), dtype=bool)
     span, covered = times[-1] - times[0], 0.0
     while covered < 0.3 * span:
-        length = _lengths(config, 1, random)[0]
+        length = _length(config, random)
         start = random.uniform(times[0] - length, times[-1])
         hidden |= (times >= start) & (times <= start + length)
         covered += length
     return hidden
 
 
-def _lengths(config: TaskConfig, count: int, random: np.random.Generator) -> NDArray[np.float64]:
+def _length(config: TaskConfig, random: np.random.Generator) -> float:
     """s, log-uniform from 1.5 typical gaps to the horizon."""
     low, high = 1.5 * config.gap_s, max(config.horizon_s, 2 * config.gap_s)
-    return np.exp(random.uniform(np.log(low), np.log(high), size=count))
+    return float(np.exp(random.uniform(np.log(low), np.log(high))))
 
 
 def take_tasks(tasks: Dataset, index: Sequence[int] | NDArray[np.int64]) -> Dataset:

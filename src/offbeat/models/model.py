@@ -69,8 +69,6 @@ class Model(BaseModel):
         self.config = config
         statistics = data.statistics
         self.time_unit = statistics.median_gap / float(config.typical_gap or 1)
-        longest = config.time_input_unit == "longest"
-        self.time_input_unit = statistics.longest_delta if longest else statistics.median_gap
         channels, hidden = self.channels, int(config.hidden_size or 1)
         self.hidden_size = hidden
 
@@ -125,6 +123,13 @@ class Model(BaseModel):
     def dtype(self) -> torch.dtype:
         """Dtype of the weights."""
         return self.cell.bias.dtype
+
+    @property
+    def time_input_unit(self) -> float:
+        """s, unit of the time input of a cell."""
+        if self.config.time_input_unit == "longest":
+            return self.statistics.longest_delta
+        return self.statistics.median_gap
 
     @property
     def needs_generator(self) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -96,6 +96,18 @@ _ANCHORED_RECIPE: dict[str, Any] = {
     "loss_scale": 100.0,
 }
 _FOREIGN_RECIPE: dict[str, Any] = {**_THESIS_RECIPE, "optimizer": "adam"}
+_TASK_RECIPE: dict[str, Any] = {
+    "epochs": 25,
+    "batch_size": 16,
+    "optimizer": "adam",
+    "learning_rate": 0.003,
+    "schedule": "cosine",
+    "clip_norm": 1.0,
+    "loss_scale": 1.0,
+    "tasks_per_epoch": 1024,
+    "loss": "relative",
+}
+"""Of any model that is trained on tasks: at least 1,600 steps, however short the log is."""
 
 
 @dataclass(frozen=True)
@@ -238,10 +250,18 @@ def recipe_of(name: str, config: TrainConfig | None = None, *, validated: bool) 
     """
     entry = MODELS[name] if name in MODELS else ModelEntry(factory=nn.Module)
     common = _THESIS_RECIPE if entry.factory is None else _FOREIGN_RECIPE
-    asked = {} if config is None else {k: v for k, v in asdict(config).items() if v is not None}
+    asked = (
+        {}
+        if config is None
+        else {
+            f.name: value for f in fields(config) if (value := getattr(config, f.name)) is not None
+        }
+    )
+    tasks = _TASK_RECIPE if "tasks" in asked else {}
     if asked.get("clip_norm") == math.inf:
         asked["clip_norm"] = None
-    return Recipe(**{"keep": "best" if validated else "last", **common, **entry.recipe, **asked})
+    keep = "best" if validated else "last"
+    return Recipe(**{"keep": keep, **common, **entry.recipe, **tasks, **asked})
 
 
 def make_model(

@@ -1,0 +1,418 @@
+"""What a model is trained and validated on: trajectories as they are, or tasks drawn from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import huber_loss
+
+from offbeat.baselines import AgeBins, Baseline, causal_baselines, fit_baseline
+from offbeat.baselines.errors import CLIPPED, ErrorTable, cells
+from offbeat.config import Recipe
+from offbeat.correction import Base, Correction, corrected, scaled
+from offbeat.data.batch import Batch
+from offbeat.data.tasks import draw_tasks
+from offbeat.data.trajectory import Dataset
+from offbeat.metrics import Scores, ScoreSums
+from offbeat.models.base import BaseModel
+from offbeat.parts.heads import Prediction
+
+REFERENCE_TASKS = 600
+"""Tasks that baselines are fitted to, and as many others that give their errors."""
+
+VALIDATION_TASKS = 300
+"""Tasks of validation, the same in every epoch."""
+
+HUBER = 3.0
+"""Errors beyond this multiple of the typical one count linearly in the relative loss."""
+
+# Streams of random numbers; those of the epochs are (seed, _EPOCHS, epoch).
+_FITTED, _MEASURED, _VALIDATED, _EPOCHS = range(4)
+
+
+def ordered(model: BaseModel, dataset: Dataset) -> Dataset:
+    """A data set with the channels in the order of a model, and its input transforms applied.
+
+    Args:
+        model: of the same channels; others are refused where a batch is made.
+        dataset: to train, validate or fit on.
+    """
+    dataset = dataset.without_actions_but(model.names)
+    if dataset.names != model.names and set(dataset.names) == set(model.names):
+        dataset = dataset.select(model.names)
+    return model.transforms.apply(dataset)
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The best baselines: their typical errors are the units of the relative loss.
+
+    Attributes:
+        baselines: fitted to tasks of the training set.
+        errors: of the best of them in each cell, on other tasks of the training set.
+        typical: (bins + 1, channels) typical errors, scaled units, positive.
+        weights: (bins + 1, channels) of errors in the loss.
+    """
+
+    baselines: tuple[Base, ...]
+    errors: ErrorTable
+    typical: Tensor
+    weights: Tensor
+
+    @property
+    def bins(self) -> AgeBins:
+        """Bins of times since observation."""
+        return self.errors.bins
+
+    @classmethod
+    def of(cls, baselines: Sequence[Base], model: BaseModel, tasks: Dataset) -> Reference:
+        """Measures fitted baselines.
+
+        Args:
+            baselines: at least one.
+            model: that is to be trained; its scales are used.
+            tasks: that the baselines were not fitted to, `ordered`.
+        """
+        batch, bins = model.batch(tasks), AgeBins.of(tasks)
+        errors = ErrorTable.best(
+            ErrorTable.of(scaled(each, model, tasks, batch), batch, bins, clipped=CLIPPED)
+            for each in baselines
+        )
+        typical = errors.typical(model.std.cpu())
+        return cls(tuple(baselines), errors, typical, errors.weights())
+
+
+def fitted_baselines(tasks: Dataset) -> tuple[Baseline, ...]:
+    """All causal baselines, fitted to tasks."""
+    return tuple(fit_baseline(name, tasks) for name in causal_baselines())
+
+
+def reference_tasks(train: Dataset, recipe: Recipe) -> tuple[Dataset, Dataset]:
+    """The tasks that baselines are fitted to, and those on which their errors are measured.
+
+    Args:
+        train: the training set, `ordered`.
+        recipe: with the tasks; without any, the trajectories are both.
+    """
+    if recipe.tasks is None:
+        return train, train
+    fitted, measured = (
+        draw_tasks(train, recipe.tasks, REFERENCE_TASKS, seed=[recipe.seed, stream])
+        for stream in (_FITTED, _MEASURED)
+    )
+    return fitted, measured
+
+
+class Examples:
+    """Trajectories in memory, with inputs that are computed once.
+
+    Args:
+        model: its scales and statistics give the step inputs.
+        batch: scaled.
+        reference: of the relative loss; None for that of the model's head.
+        terms: (batch, rows, channels) base and scale, where the model corrects a base.
+    """
+
+    def __init__(
+        self,
+        model: BaseModel,
+        batch: Batch,
+        *,
+        reference: Reference | None = None,
+        terms: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        with torch.no_grad():
+            self.prepared = model.prepare(batch)
+        # Without the first row: its prediction is a constant.
+        self.targets = batch.values[:, 1:].contiguous()
+        counted = batch.targets[:, 1:]
+        self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
+        self.terms = None if terms is None else tuple(term[:, 1:].contiguous() for term in terms)
+        self.typical = None
+        if reference is not None:
+            at = cells(batch, reference.bins)[:, 1:]
+            channel = torch.arange(batch.channels, device=at.device)
+            self.typical = reference.typical.to(self.targets)[at, channel]
+            self.counted = reference.weights.to(self.targets)[at, channel] * counted
+
+    def __len__(self) -> int:
+        return len(self.prepared)
+
+    def loss(self, model: BaseModel, index: Tensor, generator: torch.Generator | None) -> Tensor:
+        """The model's loss of the one-step-ahead prediction of some trajectories.
+
+        Args:
+            model: in its current state.
+            index: (batch,) positions of the trajectories.
+            generator: of self-feeding.
+        """
+        index = index.to(self.targets.device)
+        whole = model.run(self.prepared.take(index), generator=generator)
+        scale = None if whole.scale is None else whole.scale[:, 1:]
+        prediction = Prediction(whole.mean[:, 1:], scale)
+        rows = prediction.mean.shape[1]
+        targets = self.targets.index_select(0, index)[:, :rows]
+        mask = None
+        if self.counted is not None:
+            mask = self.counted.index_select(0, index)[:, :rows]
+        elif not rows:
+            mask = torch.ones_like(targets)
+        if self.terms is not None:
+            base, unit = (term.index_select(0, index)[:, :rows] for term in self.terms)
+            prediction = corrected(prediction, base, unit)
+        if self.typical is None or prediction.scale is not None:
+            return model.loss(prediction, targets, mask)
+        typical = self.typical.index_select(0, index)[:, :rows]
+        return relative_loss(prediction.mean, targets, typical, mask)
+
+
+def relative_loss(mean: Tensor, targets: Tensor, typical: Tensor, weights: Tensor | None) -> Tensor:
+    """Weighted mean of Huber's loss of the errors in units of typical ones.
+
+    Args:
+        mean: (batch, rows, channels) predictions.
+        targets: (batch, rows, channels).
+        typical: (batch, rows, channels) typical errors.
+        weights: (batch, rows, channels); 0 where the target does not count. None: all count alike.
+
+    Returns:
+        The mean squared relative error, where no error is beyond `HUBER` typical ones.
+    """
+    each = 2 * huber_loss(mean / typical, targets / typical, reduction="none", delta=HUBER)
+    if weights is None:
+        return each.mean()
+    return (each * weights).sum() / weights.sum().clamp_min(1e-12)
+
+
+class TrainingSet:
+    """The examples of every epoch: the trajectories, or tasks that are drawn anew.
+
+    Tasks of the next epoch are drawn in a thread while the model is trained on those of this one.
+
+    Args:
+        model: that is trained.
+        train: the training set, `ordered`.
+        recipe: with the tasks and the seed.
+        reference: of the relative loss; None for that of the model's head.
+        correction: of a base by the model, or None.
+    """
+
+    def __init__(
+        self,
+        model: BaseModel,
+        train: Dataset,
+        recipe: Recipe,
+        *,
+        reference: Reference | None = None,
+        correction: Correction | None = None,
+    ) -> None:
+        self._model, self._train, self._recipe = model, train, recipe
+        self._reference, self._correction = reference, correction
+        self._next: tuple[int, Future[Examples]] | None = None
+        self._same = None if recipe.tasks is not None else self._examples(train)
+        self._drawer = ThreadPoolExecutor(1) if recipe.tasks is not None else None
+
+    def __len__(self) -> int:
+        return self._recipe.tasks_per_epoch if self._same is None else len(self._same)
+
+    def epoch(self, epoch: int) -> Examples:
+        """The examples of an epoch, the same whenever they are asked for.
+
+        Args:
+            epoch: counted from 0.
+        """
+        if self._same is not None:
+            return self._same
+        assert self._drawer is not None
+        if self._next is not None and self._next[0] == epoch:
+            examples = self._next[1].result()
+        else:
+            examples = self._drawn(epoch)
+        if epoch + 1 < self._recipe.epochs:
+            self._next = epoch + 1, self._drawer.submit(self._drawn, epoch + 1)
+        return examples
+
+    def close(self) -> None:
+        """Ends the thread."""
+        if self._drawer is not None:
+            self._drawer.shutdown(cancel_futures=True)
+
+    def _drawn(self, epoch: int) -> Examples:
+        recipe = self._recipe
+        assert recipe.tasks is not None
+        seed = [recipe.seed, _EPOCHS, epoch]
+        return self._examples(
+            draw_tasks(self._train, recipe.tasks, recipe.tasks_per_epoch, seed=seed)
+        )
+
+    def _examples(self, tasks: Dataset) -> Examples:
+        batch, terms = self._model.batch(tasks), None
+        if self._correction is not None:
+            terms = self._correction.terms(self._model, tasks, batch)
+        return Examples(self._model, batch, reference=self._reference, terms=terms)
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Scores of a model on the validation set.
+
+    Attributes:
+        scores: in scaled units.
+        relative: mean over bins of time since observation and channels of the logarithm of the
+            ratio of the MSE to that of the best baseline; NaN without a reference.
+    """
+
+    scores: Scores
+    relative: float
+
+
+class ValidationSet:
+    """A data set that is scored repeatedly; its step inputs are computed once.
+
+    Args:
+        model: its scales and statistics give the step inputs.
+        batch: scaled by the model's scaler.
+        size: trajectories at a time.
+        terms: (batch, rows, channels) base and scale, where the model corrects a base.
+    """
+
+    def __init__(
+        self,
+        model: BaseModel,
+        batch: Batch,
+        *,
+        size: int = 500,
+        terms: tuple[Tensor, Tensor] | None = None,
+    ) -> None:
+        self.channels = batch.channels
+        self._whole, self._terms, self._size = batch, terms, size
+        self._reference: tuple[Reference, ErrorTable] | None = None
+        with torch.no_grad():
+            parts = (batch.take(slice(i, i + size)) for i in range(0, len(batch), size))
+            self.parts = [(_whole(model.prepare(part)), part) for part in parts]
+        empty = ScoreSums(self.channels)
+        for _, part in self.parts:
+            empty.add(part.values, part)
+        self.counted = empty.scores().after_first_observation.count
+
+    @classmethod
+    def of(
+        cls,
+        model: BaseModel,
+        validation: Dataset,
+        recipe: Recipe,
+        *,
+        reference: Reference | None = None,
+        correction: Correction | None = None,
+    ) -> ValidationSet:
+        """The validation set of a training: trajectories as they are, or tasks drawn once.
+
+        Args:
+            model: that is trained.
+            validation: trajectories, `ordered`.
+            recipe: with the tasks and the seed.
+            reference: of the relative score; None for none.
+            correction: of a base by the model, or None.
+        """
+        tasks = validation
+        if recipe.tasks is not None:
+            seed = [recipe.seed, _VALIDATED]
+            tasks = draw_tasks(validation, recipe.tasks, VALIDATION_TASKS, seed=seed)
+        batch = model.batch(tasks)
+        terms = None if correction is None else correction.terms(model, tasks, batch)
+        found = cls(model, batch, terms=terms)
+        if reference is not None:
+            best = ErrorTable.best(
+                ErrorTable.of(scaled(each, model, tasks, batch), batch, reference.bins)
+                for each in reference.baselines
+            )
+            found._reference = reference, best
+        return found
+
+    def scores(self, model: BaseModel, *, seed: int = 0, gap_unit: float | None = None) -> Scores:
+        """Scores a model in its current state.
+
+        Args:
+            model: to score.
+            seed: of self-feeding.
+            gap_unit: s; groups the score by time since observation, as `ScoreSums` does.
+        """
+        return self._scored(model, seed, gap_unit)[0]
+
+    def judge(self, model: BaseModel, *, seed: int = 0) -> Validation:
+        """Scores a model in its current state, also relative to the best baseline.
+
+        Args:
+            model: to score.
+            seed: of self-feeding.
+        """
+        scores, means = self._scored(model, seed, None)
+        if self._reference is None:
+            return Validation(scores, math.nan)
+        reference, best = self._reference
+        whole = torch.zeros_like(self._whole.values)
+        for i, mean in enumerate(means):
+            first = i * self._size
+            whole[first : first + len(mean), : mean.shape[1]] = mean
+        own = ErrorTable.of(whole, self._whole, reference.bins)
+        return Validation(scores, own.relative(best, reference.typical))
+
+    def _scored(
+        self, model: BaseModel, seed: int, gap_unit: float | None
+    ) -> tuple[Scores, list[Tensor]]:
+        sums = ScoreSums(self.channels, gap_unit=gap_unit)
+        means = []
+        with torch.inference_mode():
+            for i, (prepared, part) in enumerate(self.parts):
+                # One generator for all parts, as if they were one batch.
+                generator = torch.Generator().manual_seed(seed) if model.needs_generator else None
+                found: Prediction = model.run(prepared, generator=generator)
+                if self._terms is not None:
+                    at = slice(i * self._size, i * self._size + len(part))
+                    base, unit = (term[at, : part.rows] for term in self._terms)
+                    found = corrected(found, base, unit)
+                sums.add(found.mean, part)
+                means.append(found.mean)
+        return sums.scores(), means
+
+
+def _whole(prepared: Any) -> Any:
+    return prepared.take(torch.arange(len(prepared)))
+
+
+def validate(model: BaseModel, batch: Batch, *, seed: int = 0, size: int = 500) -> Scores:
+    """Scores a model on a scaled batch, in parts.
+
+    Args:
+        model: to score.
+        batch: scaled by the model's scaler.
+        seed: of self-feeding.
+        size: trajectories at a time.
+    """
+    validated = ValidationSet(model, batch, size=size)
+    return validated.scores(model, seed=seed, gap_unit=model.statistics.median_gap)
+
+
+def expect_silences(model: BaseModel, seconds: float) -> None:
+    """Lets a model know of silences that its training will have.
+
+    Its clock saturates at a multiple of the longest time since observation that was measured when
+    it was made, which tasks can exceed.
+
+    Args:
+        model: changed in place.
+        seconds: longest time since the last observation in the tasks.
+    """
+    known = model.statistics
+    model.statistics = replace(
+        known,
+        longest_elapsed=max(known.longest_elapsed, seconds),
+        longest_delta=max(known.longest_delta, seconds),
+    )
+    model.data = replace(model.data, statistics=model.statistics)

@@ -1,0 +1,338 @@
+"""Training on tasks: errors in units of the best baseline, tasks of every epoch, corrections."""
+
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+import torch
+
+import offbeat as ob
+from offbeat.baselines import AgeBins, LastValue, fit_baseline
+from offbeat.baselines.errors import ErrorTable, cells
+from offbeat.config import TaskConfig
+from offbeat.data.tasks import TWO_SIDED, draw_tasks
+from offbeat.examples import (
+    Reference,
+    TrainingSet,
+    ValidationSet,
+    fitted_baselines,
+    reference_tasks,
+    relative_loss,
+)
+from offbeat.models.zoo import recipe_of
+
+TASKS = TaskConfig(horizon_s=0.5, gap_s=0.05, window_s=2.0)
+SMALL = {"hidden_size": 4, "field_units": (8,), "decoder_units": (8,)}
+
+
+def swings(n: int = 6, rows: int = 120, seed: int = 0) -> ob.Dataset:
+    """Two pendulums and a quiet channel of noise, every 50 ms, all observed but a few values."""
+    random = np.random.default_rng(seed)
+    trajectories = []
+    for _ in range(n):
+        times = 0.05 * np.arange(rows) + random.uniform(0, 10)
+        phase = random.uniform(0, 2 * np.pi, 2)
+        values = np.stack(
+            [
+                np.sin(3 * times + phase[0]),
+                np.cos(5 * times + phase[1]),
+                0.01 * random.normal(size=rows),
+            ],
+            axis=1,
+        )
+        observed = random.random(values.shape) < 0.9
+        trajectories.append(ob.Trajectory(times, values, observed, names=("a", "b", "c")))
+    return ob.Dataset(tuple(trajectories))
+
+
+TRAIN, VALIDATION = swings(6, seed=1), swings(3, seed=2)
+
+
+def weights(model: ob.Model) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in model.state_dict().items()}
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+# --- errors -----------------------------------------------------------------------------------
+
+
+def test_errors_are_counted_in_the_bin_of_the_time_since_the_last_observation():
+    tasks = draw_tasks(TRAIN, TASKS, 20, seed=3)
+    bins = AgeBins.of(tasks)
+    predicted = fit_baseline("last_value", tasks).predict(tasks)
+    batch = ob.Batch.of(tasks, dtype=torch.float64)
+    padded = torch.zeros_like(batch.values)
+    for row, values in zip(padded, predicted, strict=True):
+        row[: len(values)] = torch.from_numpy(values)
+    table = ErrorTable.of(padded, batch, bins)
+    expected = [[[] for _ in range(3)] for _ in range(len(bins) + 1)]
+    for task, values in zip(tasks, predicted, strict=True):
+        for c in range(3):
+            last = None
+            for i, time in enumerate(task.times):
+                if i and task.known[i, c]:
+                    at = len(bins)
+                    if last is not None:
+                        at = min(int(np.searchsorted(bins.edges, time - last)), len(bins) - 1)
+                    expected[at][c].append((values[i, c] - task.values[i, c]) ** 2)
+                if task.observed[i, c]:
+                    last = time
+    assert table.count.tolist() == [[len(cell) for cell in row] for row in expected]
+    for row, errors in zip(table.mse.tolist(), expected, strict=True):
+        for mse, cell in zip(row, errors, strict=True):
+            assert mse == pytest.approx(np.mean(cell), rel=1e-9) if cell else math.isnan(mse)
+
+
+def test_each_bin_of_each_channel_has_the_same_weight_in_the_loss():
+    bins = AgeBins(np.array([0.1, 0.2]))
+    count = torch.tensor([[1000.0, 500.0], [400.0, 500.0], [70.0, 0.0]])
+    table = ErrorTable(bins, torch.ones_like(count), count)
+    total = table.weights() * count
+    assert total[:2].allclose(total[0, 0])
+    assert float(total[2, 0]) == pytest.approx(0.25 * float(total[0, 0]) * 70 / 125)
+    assert float(total.sum()) == pytest.approx(float(count.sum()))
+
+
+def test_a_cell_without_errors_takes_the_typical_error_of_its_neighbour():
+    bins = AgeBins(np.array([0.1, 0.2, 0.4]))
+    nan = math.nan
+    mse = torch.tensor([[0.04, nan], [nan, nan], [nan, 0.09], [nan, 0.0]], dtype=torch.float64)
+    found = ErrorTable(bins, mse, (~mse.isnan()).double()).typical(torch.tensor([1.0, 2.0]))
+    expected = torch.tensor([[0.2, 0.3], [0.2, 0.3], [0.2, 0.3], [1.0, 0.002]])
+    assert found.allclose(expected.double())
+
+
+def test_wild_values_do_not_change_the_typical_error_of_a_channel():
+    wild = []
+    for t in TRAIN:
+        values = t.values.copy()
+        values[7, 0] = -999.0
+        wild.append(replace(t, values=values, observed=t.observed & (values > -999)))
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    typical = []
+    for data in (TRAIN, ob.Dataset(tuple(wild))):
+        tasks = draw_tasks(data, replace(TASKS, shares={"logged": 1.0}), 300, seed=0)
+        baselines = [fit_baseline("last_value", tasks)]
+        typical.append(Reference.of(baselines, model, tasks).typical[0])
+    assert typical[1][1:].allclose(typical[0][1:])
+    assert float(typical[1][0]) < 60 * float(typical[0][0])  # the MSE itself grows by 10^6
+
+
+def test_the_relative_loss_is_the_squared_relative_error_and_linear_beyond_three():
+    targets = torch.zeros(1, 3, 1)
+    typical = torch.tensor([0.5, 0.1, 2.0]).view(1, 3, 1)
+    mean = torch.tensor([0.5, -0.2, 20.0]).view(1, 3, 1)  # 1, 2 and 10 typical errors
+    weights = torch.tensor([1.0, 3.0, 2.0]).view(1, 3, 1)
+    expected = (1 * 1 + 3 * 4 + 2 * (2 * 3 * 10 - 9)) / 6
+    assert float(relative_loss(mean, targets, typical, weights)) == pytest.approx(expected)
+
+
+def test_the_relative_score_is_the_log_of_a_geometric_mean_of_ratios():
+    bins, few = AgeBins(np.array([0.1, 0.2])), torch.ones(3, 2, dtype=torch.float64)
+    table = ErrorTable(bins, few, 1e9 * few)
+    better = ErrorTable(bins, torch.tensor([[0.25, 1], [1, 4], [9, 9]]).double(), 1e9 * few)
+    assert table.relative(table, few) == 0
+    assert better.relative(table, few) == pytest.approx(0, abs=1e-6)
+    half = ErrorTable(bins, 0.25 * few, 1e9 * few)
+    assert half.relative(table, few) == pytest.approx(math.log(0.25), rel=1e-6)
+    rare = ErrorTable(bins, 100 * few, few)  # one error per cell says little
+    assert 0 < rare.relative(ErrorTable(bins, few, few), few) < math.log(11)
+
+
+# --- tasks of every epoch ---------------------------------------------------------------------
+
+
+def test_every_epoch_has_tasks_of_its_own_and_the_same_whenever_it_is_asked_for():
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    recipe = recipe_of("gru", ob.TrainConfig(tasks=TASKS, tasks_per_epoch=12), validated=True)
+    drawn = TrainingSet(model, TRAIN, recipe)
+    again = TrainingSet(model, TRAIN, recipe)
+    first, second = drawn.epoch(0), drawn.epoch(1)
+    assert len(first) == len(drawn) == 12
+    assert torch.equal(again.epoch(1).prepared.table, second.prepared.table)
+    assert not torch.equal(first.targets[:, :10], second.targets[:, :10])
+    drawn.close(), again.close()
+
+
+@pytest.mark.parametrize("name", ["gru", "anchored_ode_gru_d"])
+def test_a_training_on_tasks_that_was_killed_ends_as_if_it_had_not_been(name, tmp_path):
+    config = ob.TrainConfig(
+        tasks=TASKS, epochs=3, tasks_per_epoch=40, batch_size=8, checkpoint_every=2
+    )
+    options = {"hidden_size": 4, "field_units": (8,)}
+    whole = ob.make_model(name, TRAIN, **options)
+    expected = ob.fit(whole, TRAIN, VALIDATION, config, progress=False)
+
+    class Killed(BaseException):
+        pass
+
+    steps = 0
+    import offbeat.training as training
+
+    step = training.train_step
+
+    def killed(*args, **kwargs):
+        nonlocal steps
+        steps += 1
+        if steps == 8:  # in the middle of the second epoch
+            raise Killed
+        return step(*args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "train_step", killed)
+        with pytest.raises(Killed):
+            ob.fit(ob.make_model(name, TRAIN, **options), TRAIN, VALIDATION, config, out=tmp_path,
+                   progress=False)  # fmt: skip
+    resumed = ob.make_model(name, TRAIN, **options)
+    result = ob.fit(resumed, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
+    assert same(weights(resumed), weights(whole))
+    strip = [[replace(r, seconds=0.0) for r in found.history] for found in (result, expected)]
+    assert strip[0] == strip[1]
+    loaded = ob.load_model(tmp_path)
+    task = draw_tasks(VALIDATION, TASKS, 3, seed=5)
+    for a, b in zip(ob.predict(resumed, task), ob.predict(loaded, task), strict=True):
+        assert np.array_equal(a.values, b.values)
+
+
+def test_a_model_keeps_moving_through_the_longest_silence_of_its_tasks():
+    """Its clock saturates at a multiple of the longest silence that it knows of."""
+    whole = ob.Dataset(tuple(replace(t, observed=None) for t in TRAIN))
+    model = ob.make_model("anchored_ode_gru_d", whole, **SMALL)
+    assert model.statistics.longest_elapsed == pytest.approx(0.05)
+    config = ob.TrainConfig(tasks=replace(TASKS, horizon_s=1.0), epochs=1, tasks_per_epoch=8)
+    ob.fit(model, whole, config=config, progress=False)
+    assert model.statistics.longest_elapsed == 1.0
+
+
+def test_without_options_tasks_bring_a_recipe_with_a_relative_loss():
+    recipe = recipe_of("anchored_ode_gru_d", ob.TrainConfig(tasks=TASKS), validated=True)
+    assert (recipe.loss, recipe.schedule, recipe.loss_scale) == ("relative", "cosine", 1.0)
+    assert recipe.epochs * recipe.tasks_per_epoch / recipe.batch_size > 1000
+    plain = recipe_of("anchored_ode_gru_d", ob.TrainConfig(), validated=True)
+    assert (plain.loss, plain.tasks) == ("head", None)
+
+
+def test_a_config_of_tasks_survives_json():
+    config = ob.TrainConfig(tasks=replace(TASKS, sensors=(("a",), ("b", "c")), shares=TWO_SIDED))
+    assert ob.TrainConfig(**asdict(config)) == config
+    with pytest.raises(ob.InputError, match="sum to 1"):
+        TaskConfig(horizon_s=1, gap_s=0.1, shares={"cut": 0.5})
+    with pytest.raises(ob.InputError, match="unknown key of TaskConfig"):
+        ob.TrainConfig(tasks={"horizon": 1.0})
+
+
+def test_the_relative_loss_learns_a_quiet_channel_that_the_mse_does_not_see():
+    """A slow wave of a thousandth of the amplitude of the others, which are noise."""
+    random = np.random.default_rng(0)
+    times = 0.05 * np.arange(200)
+    trajectories = []
+    for _ in range(8):
+        ramp = 0.001 * np.sin(times + random.uniform(0, 6))
+        noise = random.normal(size=(200, 2))
+        values = np.column_stack([ramp, noise])
+        trajectories.append(ob.Trajectory(times, values, names=("slow", "n1", "n2")))
+    data = ob.Dataset(tuple(trajectories))
+    scores = {}
+    for loss in ("head", "relative"):
+        model = ob.make_model("gru", data, scaler="identity", seed=0, hidden_size=8)
+        tasks = replace(TASKS, shares={"logged": 1.0})
+        config = ob.TrainConfig(
+            tasks=tasks, loss=loss, epochs=8, tasks_per_epoch=320, learning_rate=0.01
+        )
+        ob.fit(model, data, data, config, progress=False)
+        scores[loss] = ob.evaluate(model, data).scores["gru"]
+    slow = {k: s.after_first_observation.per_channel[0] for k, s in scores.items()}
+    assert slow["relative"] < 0.5 * slow["head"]
+
+
+# --- the score --------------------------------------------------------------------------------
+
+
+def test_the_score_of_a_validation_set_is_0_for_the_best_baseline_itself():
+    recipe = recipe_of("gru", ob.TrainConfig(tasks=TASKS), validated=True)
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    fitted, measured = reference_tasks(TRAIN, recipe)
+    last = fit_baseline("last_value", fitted)
+    reference = Reference.of([last], model, measured)
+
+    class Repeats(ob.BaseModel):
+        def forward(self, batch):
+            before = torch.from_numpy(model.scaler.scaled(last.mean)).float()
+            return ob.Prediction(ob.last_values(batch.values, batch.mask, before=before))
+
+    repeats = Repeats("repeats", model.data)
+    found = ValidationSet.of(repeats, VALIDATION, recipe, reference=reference).judge(repeats)
+    assert found.relative == pytest.approx(0, abs=1e-5)
+    every = Reference.of(fitted_baselines(fitted), model, measured)
+    found = ValidationSet.of(repeats, VALIDATION, recipe, reference=every).judge(repeats)
+    assert found.relative > 0.1
+
+
+def test_the_log_has_the_score_and_the_best_epoch_is_the_one_that_is_kept(tmp_path):
+    model = ob.make_model("gru", TRAIN, **SMALL)
+    config = ob.TrainConfig(tasks=TASKS, epochs=3, tasks_per_epoch=32)
+    result = ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
+    scores = [record.validation_score for record in result.history]
+    assert all(math.isfinite(score) for score in scores)
+    assert result.validation_score == min(scores)
+    assert scores.index(min(scores)) == result.best_epoch - 1
+    assert "validation_score" in (tmp_path / "log.csv").read_text().splitlines()[0]
+
+
+# --- corrections ------------------------------------------------------------------------------
+
+
+def test_a_correction_starts_at_its_base_and_gets_better(tmp_path):
+    base = fit_baseline("last_value", TRAIN)
+    model = ob.make_model("gru", TRAIN, hidden_size=16, decoder_units=(16,))
+    config = ob.TrainConfig(tasks=TASKS, epochs=8, tasks_per_epoch=256, learning_rate=0.01)
+    task = draw_tasks(VALIDATION, TASKS, 30, seed=7)
+    frozen = replace(config, epochs=1, tasks_per_epoch=1, learning_rate=1e-30)
+    start = ob.fit(ob.make_model("gru", TRAIN, **SMALL), TRAIN, config=frozen, base=base,
+                   progress=False)  # fmt: skip
+    untrained = ob.make_model("gru", TRAIN, **SMALL)
+    for tensor in untrained.head.layers[-1] if untrained.head.layers else ():
+        torch.nn.init.zeros_(tensor)
+    for ours, theirs in zip(
+        start.correction.predict(untrained, task), base.predict(task), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    result = ob.fit(model, TRAIN, VALIDATION, config, base=base, out=tmp_path, progress=False)
+    errors = {}
+    for name, found in {
+        "base": base.predict(task),
+        "corrected": result.correction.predict(model, task),
+    }.items():
+        errors[name] = np.mean(
+            [np.nanmean((p - t.values)[1:, :2] ** 2) for p, t in zip(found, task, strict=True)]
+        )
+    assert errors["corrected"] < 0.7 * errors["base"]
+    with pytest.raises(ob.InputError, match="the predictor that is corrected differ"):
+        ob.fit(ob.make_model("gru", TRAIN, hidden_size=16, decoder_units=(16,)), TRAIN, VALIDATION,
+               config, base=fit_baseline("mean", TRAIN), out=tmp_path, progress=False)  # fmt: skip
+
+
+def test_an_anchored_model_cannot_correct_a_base():
+    model = ob.make_model("anchored_ode_gru_d", TRAIN, **SMALL)
+    with pytest.raises(ob.InputError, match="cannot correct a base"):
+        ob.fit(model, TRAIN, base=fit_baseline("last_value", TRAIN), progress=False)
+
+
+def test_cells_are_the_bins_that_baselines_use():
+    tasks = draw_tasks(TRAIN, TASKS, 5, seed=1)
+    batch, bins = ob.Batch.of(tasks), AgeBins.of(tasks)
+    found = cells(batch, bins)
+    assert int(found[:, 0].min()) == len(bins)
+    last = LastValue().fit(tasks)
+    state = last.start(torch.zeros(5, 3, dtype=torch.float64))
+    for i in range(batch.rows):
+        time = batch.times[:, i, None]
+        age = last.history.age(state, time)
+        expected = torch.where(age.isinf(), len(bins), bins.of_age(age))
+        inside = batch.valid[:, i]
+        assert torch.equal(found[inside, i], expected[inside])
+        state = last.observe(state, time, batch.values[:, i].double(), batch.mask[:, i])
