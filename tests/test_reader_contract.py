@@ -23,7 +23,7 @@ RNG = np.random.default_rng(0)
 STAMPS = START + 1000 * np.cumsum(RNG.integers(1000, 30_000, 150))
 VALUES = RNG.normal(size=(150, 2))
 TEXT = ("csv", "csv long", "tum", "euroc", "euroc folder")
-MESSAGES = ("ros", "ulog")  # formats that can be read up to where they are cut
+UP_TO_THE_CUT = ("csv", "tum", "euroc", "ros", "ulog")  # formats of lines and of messages
 SKIPPED = {"offbeat": "a data set of ours is finished: it has no clock and is not cleaned"}
 
 
@@ -203,7 +203,7 @@ def test_a_truncated_file_is_an_error_of_one_line_or_reads_up_to_the_cut(variant
         file.write_bytes(content[:end])
     else:
         file.write_bytes(content[: len(content) * 6 // 10])
-    if variant.split()[0] not in MESSAGES:
+    if variant.split()[0] not in UP_TO_THE_CUT:
         with pytest.raises(FileFormatError) as error:
             read_back(variant, log)
         one_line(error)
@@ -211,7 +211,8 @@ def test_a_truncated_file_is_an_error_of_one_line_or_reads_up_to_the_cut(variant
     with contextlib.suppress(FileFormatError):
         rest = read_back(variant, log)
         assert rest.meta["cleaning"]["notes"] != whole.meta["cleaning"]["notes"]  # it is noted
-        assert 0 < rest[0].rows < whole[0].rows
+        lost = 0 if variant == "csv long" else 1  # of the last row, one of two values
+        assert 0 < rest[0].rows <= whole[0].rows - lost
 
 
 def test_a_missing_and_an_empty_file_are_errors_of_one_line(variant, log):

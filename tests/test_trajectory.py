@@ -78,7 +78,7 @@ def test_an_integer_clock_loses_no_nanosecond(start, steps):
 
 
 def test_an_unknown_unit_of_time_is_refused_with_the_choices():
-    with pytest.raises(ob.InputError, match="one of: 100ns, ms, ns, s, us"):
+    with pytest.raises(ob.InputError, match="one of: 100ns, d, h, min, ms, ns, s, us"):
         ob.Trajectory.from_arrays(TIMES, VALUES, time_unit="sec")
 
 

@@ -8,8 +8,22 @@ from collections.abc import Iterable
 from types import ModuleType
 
 
+def printable(text: str) -> str:
+    r"""A text whose control characters are escaped, so that a terminal shows it and obeys none.
+
+    Names in files may hold any character. Line ends and tabs stay; others that are not printed,
+    such as escape sequences and marks that reverse the direction of writing, become `\x1b`.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+
+
 class OffbeatError(Exception):
-    """Base class of all errors of Offbeat."""
+    """Base class of all errors of Offbeat; a message holds no control characters."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(printable(arg) if isinstance(arg, str) else arg for arg in args))
 
 
 class InputError(OffbeatError, ValueError):
@@ -26,6 +40,9 @@ class MissingExtraError(OffbeatError, ImportError):
 
 class DivergenceError(OffbeatError, ArithmeticError):
     """A computation diverged: a loss is NaN, or a solver exceeded its number of steps."""
+
+
+_MOST_LISTED, _MOST_COMPARED = 50, 2000  # choices in a message
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -56,6 +73,8 @@ def one_of(what: str, got: str, choices: Iterable[str]) -> str:
     known = sorted(choices)
     if got in known:
         return got
-    near = difflib.get_close_matches(str(got), known, n=1)
+    near = difflib.get_close_matches(str(got), known[:_MOST_COMPARED], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise InputError(f"unknown {what} {got!r}, expected one of: {', '.join(known)}{hint}")
+    more = f" and {len(known) - _MOST_LISTED} more" if len(known) > _MOST_LISTED else ""
+    shown = ", ".join(known[:_MOST_LISTED]) + more
+    raise InputError(f"unknown {what} {got!r}, expected one of: {shown}{hint}")

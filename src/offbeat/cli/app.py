@@ -25,7 +25,7 @@ from offbeat.cli.simulate import simulate_command
 from offbeat.cli.stream import stream_command
 from offbeat.cli.sweep import sweep_command
 from offbeat.cli.train import train_command
-from offbeat.errors import OffbeatError
+from offbeat.errors import OffbeatError, printable
 
 DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
 
@@ -125,6 +125,6 @@ def run_commands(
 
 
 def _fail(message: str, code: int) -> int:
-    line = " ".join(message.split())
+    line = printable(" ".join(message.split()))
     print(f"offbeat: error: {line}", file=sys.stderr)
     return code

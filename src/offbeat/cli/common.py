@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.errors import FileFormatError, InputError, one_of, printable
 
 if TYPE_CHECKING:
     from offbeat.data.trajectory import Dataset
@@ -18,7 +18,7 @@ READER_FILE = "reader.json"
 
 def say(result: Any, text: str, as_json: bool) -> None:
     """Prints a result as JSON or as text."""
-    print(json.dumps(result, indent=2) if as_json else text)
+    print(json.dumps(result, indent=2) if as_json else printable(text))
 
 
 def plain(config: dict[str, Any]) -> dict[str, Any]:
@@ -113,7 +113,9 @@ def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) ->
         # An integer clock was read relative to its first row; this restores it exactly.
         unit, start = dataset.meta["time_unit"], np.repeat(dataset.meta["clock_start"], each)
         ticks = seconds / SECONDS_PER[unit]
-        columns[f"clock_{unit}"] = start + (ticks if unit == "s" else np.rint(ticks).astype(int))
+        columns[f"clock_{unit}"] = start + (
+            ticks if SECONDS_PER[unit] >= 1 else np.rint(ticks).astype(int)
+        )
     values = np.concatenate([t.values for t in answers])
     added = {name: values[:, i] for i, name in enumerate(answers.names)}
     if masks:

@@ -14,7 +14,7 @@ import re
 from argparse import ArgumentError
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, NotRequired
+from typing import Any, NamedTuple, NoReturn, NotRequired, get_args
 
 import yaml
 from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first unseen
@@ -232,12 +232,15 @@ class _Flag(argparse.Action):
 
 
 class _Listed:
-    """Takes a list as `a,b,c`, or as YAML."""
+    """Takes a list as `a,b,c`, or as YAML; a single name stays one where the option allows it."""
 
     def __init__(self, kind: Any) -> None:
         self.kind = kind
+        self.or_text = str in get_args(kind)
 
     def __call__(self, text: str) -> Any:
+        if self.or_text and "," not in text:
+            return text
         return text if text[:1] in ("[", "{", '"') or text == "null" else text.split(",")
 
     def __repr__(self) -> str:

@@ -78,10 +78,10 @@ def _check_since(dataset: Dataset, times: list[float]) -> None:
 
     if "clock_start" not in dataset.meta:
         return
-    per_second = NANOSECONDS_PER["s"] // NANOSECONDS_PER[dataset.meta["time_unit"]]
+    unit, second = NANOSECONDS_PER[dataset.meta["time_unit"]], NANOSECONDS_PER["s"]
     last = max(float(t.times[-1]) for t in dataset)
     for start, trajectory in zip(dataset.meta["clock_start"], dataset, strict=True):
-        shown = start / per_second
+        shown = start / (second // unit) if unit <= second else start * (unit // second)
         for time in times:
             if time > last and shown <= time <= shown + trajectory.times[-1]:
                 raise InputError(

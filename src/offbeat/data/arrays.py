@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.errors import InputError
+
 
 def frozen(value: Any, dtype: Any) -> NDArray[Any]:
     """Returns a read-only array that nothing else can write to; copies if needed.
@@ -36,6 +38,44 @@ def hand_over(array: NDArray[Any]) -> NDArray[Any]:
         part.flags.writeable = False
         part = part.base
     return array
+
+
+def without_mask(value: Any, what: str) -> Any:
+    """A masked array as a plain one: NaN where it is masked; anything else as it is.
+
+    Raises:
+        InputError: times or other values without a NaN are masked.
+    """
+    if not isinstance(value, np.ma.MaskedArray):
+        return value
+    mask = np.ma.getmaskarray(value)
+    if not mask.any():
+        return value.data
+    if what.startswith("times"):
+        raise InputError(f"{what} are masked at row {int(mask.argmax())}; drop that row")
+    return np.where(mask, np.nan, value.data.astype(np.float64))
+
+
+def since_first(clock: NDArray[Any]) -> NDArray[np.float64]:
+    """Seconds since the first entry of an array of `datetime64` or `timedelta64`.
+
+    Raises:
+        InputError: an entry is NaT.
+    """
+    missing = np.isnat(clock)
+    if missing.any():
+        raise InputError(f"times have NaT at row {int(missing.argmax())}; drop that row")
+    if not clock.size:
+        return np.zeros(clock.shape)
+    ticks = clock - clock.reshape(-1)[0]  # exact, in the unit of the clock
+    unit, count = np.datetime_data(ticks.dtype)
+    if unit in ("ps", "fs", "as"):
+        ticks = ticks.astype("timedelta64[ns]")
+        unit, count = "ns", 1
+    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}.get(unit)
+    if per_second is None or count != 1:
+        return np.asarray(ticks / np.timedelta64(1, "s"), dtype=np.float64)
+    return np.asarray(ticks.astype(np.int64) / per_second, dtype=np.float64)
 
 
 def _is_frozen(array: NDArray[Any]) -> bool:

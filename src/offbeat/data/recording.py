@@ -8,7 +8,7 @@ changes in a log, and merges signals of different rates on the union of their ti
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from offbeat.data.cleaning.anomalies import merge_rows
 from offbeat.data.cleaning.channels import find_repeats, make_continuous, new_values, unwrap
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
 from offbeat.data.cleaning.described import Channels
-from offbeat.data.cleaning.log import CleaningLog
+from offbeat.data.cleaning.log import CleaningLog, listed
 from offbeat.data.cleaning.merging import Episode, cut
 from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
 from offbeat.data.outliers import search
@@ -45,21 +45,31 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
 
     Returns:
         A trajectory per recording, or several where it was split. `meta` holds `time_unit`, the log
-        of the `cleaning`, `labels` (where recordings have them) and `clock_start` (the recording's
-        clock at time 0, in `time_unit`, where that is not 0), each with an entry per trajectory.
+        of the `cleaning`, `found` (options that were found or assumed, such as the unit of time),
+        `labels` (where recordings have them) and `clock_start` (the recording's clock at time 0, in
+        `time_unit`, where that is not 0); the last two have an entry per trajectory.
 
     Raises:
         FileFormatError: an option refuses an anomaly, or no row is left.
         InputError: an option names a channel that does not exist.
     """
     options = options or ReaderOptions()
-    waiting: list[Recording | None] = list(recordings)
+    log = CleaningLog()
+    waiting: list[Recording | None] = [_with_missing(r, options, log) for r in recordings]
     given = [recording for recording in waiting if recording is not None]
     channels = Channels.of(given, options)
-    unit = _common([recording.time_unit for recording in given], "ns")
+    unit = _common([recording.time_unit for recording in given if recording.signals], "ns")
+    found: dict[str, Any] = {}
+    if any(recording.unit_found for recording in given):
+        found["time_unit"] = unit
+    if channels.degrees:
+        found["units"] = dict.fromkeys(channels.degrees, "deg")
+        log.notes[
+            f"angles without a unit are taken to be in deg: {listed(list(channels.degrees))}"
+        ] = None
     labelled = any(recording.label for recording in given)
     del given
-    log = CleaningLog(quaternions=[list(channels.names_of(four)) for four in channels.quaternions])
+    log.quaternions = [list(channels.names_of(four)) for four in channels.quaternions]
     episodes: list[Episode] = []
     for i, recording in enumerate(waiting):
         assert recording is not None
@@ -88,13 +98,30 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
         hand_over(episode.values)
     trajectories = tuple(episode.trajectory(channels, options) for episode in episodes)
     meta: dict[str, Any] = {"time_unit": unit}
+    if found:
+        meta["found"] = found
     if labelled:
         meta["labels"] = [episode.label for episode in episodes]
     starts = [_clock(episode, unit) for episode in episodes]
     if options.start == "first_row" and any(starts):
         meta["clock_start"] = starts
-    found = [{"episode": i, **e.anomalies} for i, e in enumerate(episodes) if e.anomalies]
-    return Dataset(trajectories, {**meta, "cleaning": log.to_dict(options, found)})
+    unclean = [{"episode": i, **e.anomalies} for i, e in enumerate(episodes) if e.anomalies]
+    return Dataset(trajectories, {**meta, "cleaning": log.to_dict(options, unclean)})
+
+
+def _with_missing(recording: Recording, options: ReaderOptions, log: CleaningLog) -> Recording:
+    """The recording with NaN in place of the numbers that stand for missing values."""
+    numbers = [number for number in options.missing if not np.isnan(number)]
+    if not numbers:
+        return recording
+    signals = []
+    for signal in recording.signals:
+        missing = np.isin(signal.values, numbers)
+        log.replaced += int(missing.sum())
+        if missing.any():
+            signal = replace(signal, values=np.where(missing, np.nan, signal.values))
+        signals.append(signal)
+    return replace(recording, signals=tuple(signals))
 
 
 def _extend_actions(episode: Episode, channels: Channels) -> None:

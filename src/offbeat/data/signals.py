@@ -14,6 +14,9 @@ from offbeat.errors import InputError, one_of
 KINDS = ("", "angle", "quaternion")
 """Kinds of channels."""
 
+MOST_CHANNELS = 20_000
+"""Channels of a data set; a file with more is refused before it is read."""
+
 
 @dataclass(frozen=True, eq=False)
 class Signal:
@@ -97,6 +100,10 @@ class Recording:
         notes: assumptions and omissions of the reader, such as "stamps are row number / fps".
         clock_zero: the file's clock at stamp 0, in `time_unit`, if the stamps do not
             count from the clock's own zero because that would exceed an int64.
+        unit_found: whether nothing in the file states `time_unit`: the reader found it from the
+            numbers, or assumed it.
+        left_out: names of what the file has and the reader left out, which the option `without`
+            may name.
 
     Raises:
         InputError: the unit is unknown.
@@ -108,6 +115,8 @@ class Recording:
     time_unit: str = "ns"
     notes: tuple[str, ...] = ()
     clock_zero: int = 0
+    unit_found: bool = False
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         one_of("time unit", self.time_unit, NANOSECONDS_PER)

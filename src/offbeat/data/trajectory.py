@@ -11,10 +11,19 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.data.arrays import frozen, hand_over
+from offbeat.data.arrays import frozen, hand_over, since_first, without_mask
 from offbeat.errors import InputError, one_of
 
-SECONDS_PER = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "100ns": 1e-7, "ns": 1e-9}
+SECONDS_PER = {
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "100ns": 1e-7,
+    "ns": 1e-9,
+    "min": 60.0,
+    "h": 3600.0,
+    "d": 86_400.0,
+}
 """Units of input times; internally, times are in seconds."""
 
 STATE, ACTION, EXOGENOUS = ROLES = ("state", "action", "exogenous")
@@ -33,8 +42,10 @@ class Trajectory:
     down to the array that owns the memory, are not copied.
 
     Args:
-        times: (rows,) seconds, finite, strictly increasing; stored as float64.
-        values: (rows, channels) NaN where not known; stored as float64.
+        times: (rows,) seconds, finite, strictly increasing; stored as float64. A `timedelta64` is
+            converted; a `datetime64` is refused, `from_arrays` takes it.
+        values: (rows, channels) NaN where not known; stored as float64. What a masked array masks
+            is not known.
         observed: (rows, channels) bool; by default every known value.
         names: one unique name per channel; by default `channel_0`, `channel_1`, ...
         units: one unit per channel, such as `rad/s`; by default empty.
@@ -56,8 +67,8 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         where = f" (of {self.origin})" if self.origin else ""
-        times = _array(self.times, "times", where)
-        values = _array(self.values, "values", where)
+        times = _array(_seconds(self.times, where), "times", where)
+        values = _array(without_mask(self.values, "values"), "values", where)
         if times.ndim != 1:
             raise InputError(f"times{where} must have shape (rows,), got shape {times.shape}")
         if values.ndim != 2 or len(values) != len(times):
@@ -116,23 +127,26 @@ class Trajectory:
         the clock becomes float64, which avoids rounding errors.
 
         Args:
-            times: (rows,) in `time_unit`.
-            values: (rows, channels) NaN where not known.
-            time_unit: one of `s`, `ms`, `us`, `100ns` (ticks of Windows), `ns`.
+            times: (rows,) in `time_unit`; or `datetime64` or `timedelta64`, which have a unit of
+                their own and count from the first row.
+            values: (rows, channels) NaN where not known, or masked.
+            time_unit: one of `s`, `ms`, `us`, `100ns` (ticks of Windows), `ns`, `min`, `h`, `d`.
             **fields: the other fields of `Trajectory`.
 
         Raises:
             InputError: as `Trajectory`, or an unknown unit.
         """
         factor = SECONDS_PER[one_of("time unit", time_unit, SECONDS_PER)]
-        clock = np.asarray(times)
+        clock = np.asarray(without_mask(times, "times"))
+        if clock.dtype.kind in "mM":
+            return cls(since_first(clock), values, **fields)  # type: ignore[arg-type]
         if clock.dtype.kind in "iu" and clock.size:
             clock = clock.astype(np.int64)
             clock = clock - clock.reshape(-1)[0]
         seconds = np.asarray(clock, dtype=np.float64)
         # Dividing by the exact 1000 rounds once; multiplying by the inexact 0.001 rounds twice.
-        seconds = seconds / round(1 / factor)
-        return cls(seconds, np.asarray(values, dtype=np.float64), **fields)
+        seconds = seconds * factor if factor > 1 else seconds / round(1 / factor)
+        return cls(seconds, values, **fields)  # type: ignore[arg-type]
 
     @property
     def rows(self) -> int:
@@ -202,6 +216,17 @@ def _described(
     for role in roles:
         one_of("role of a channel", role, ROLES)
     return names, units, roles
+
+
+def _seconds(times: Any, where: str) -> Any:
+    """Times without a mask or a unit of NumPy."""
+    times = without_mask(times, f"times{where}")
+    kind = times.dtype.kind if isinstance(times, np.ndarray) else ""
+    if kind == "M":
+        raise InputError(
+            f"times{where} are {times.dtype}, expected seconds; Trajectory.from_arrays takes dates"
+        )
+    return times / np.timedelta64(1, "s") if kind == "m" else times
 
 
 def _array(value: ArrayLike, what: str, where: str) -> NDArray[np.float64]:

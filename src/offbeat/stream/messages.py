@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.data.arrays import without_mask
 from offbeat.data.scaler import Scaler
 from offbeat.data.trajectory import SECONDS_PER
 from offbeat.errors import InputError, one_of
@@ -37,7 +38,7 @@ class Clock:
     """
 
     def __init__(self, unit: str) -> None:
-        self.unit = one_of("time unit", unit, SECONDS_PER)
+        self.unit = one_of("time unit", unit, [u for u, s in SECONDS_PER.items() if s <= 1])
         # Dividing by the exact 1000 rounds once; multiplying by the inexact 0.001 rounds twice.
         self.ticks = round(1 / SECONDS_PER[unit])
         self.origin: Time | None = None
@@ -49,7 +50,8 @@ class Clock:
             InputError: it is not a finite number, or a float too large to be exact.
         """
         if type(t) is not float:
-            if isinstance(t, bool | np.bool_):
+            # A timedelta64 is an integer in a unit of its own.
+            if isinstance(t, bool | np.bool_ | np.datetime64 | np.timedelta64):
                 raise InputError(f"a time must be a number in {self.unit}, got {t!r}")
             try:
                 return int(operator.index(t))
@@ -152,7 +154,7 @@ class RowReader:
 
     def _all(self, values: Any) -> NDArray[np.float64]:
         try:
-            raw = np.asarray(values)
+            raw = np.asarray(without_mask(values, "values"))
             if raw.dtype.kind not in "fiuO":
                 raise TypeError(f"they are {raw.dtype}")
             if raw.dtype.kind == "O":

@@ -90,7 +90,7 @@ def in_order(
 
 
 def one_row_per_stamp(
-    stamps: Stamps, values: Values, choice: Literal["last", "first", "mean", "refuse"]
+    stamps: Stamps, values: Values, choice: Literal["auto", "last", "first", "mean", "refuse"]
 ) -> tuple[Stamps, Values]:
     """Merges the rows of each stamp, per channel, over known values."""
     starts = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1) != 0)
@@ -99,15 +99,39 @@ def one_row_per_stamp(
     return stamps[starts], merge_rows(values, starts, choice)
 
 
+def rows_that_differ(stamps: Stamps, values: Values) -> int:
+    """Number of rows with a known value other than the last one of their stamp.
+
+    Args:
+        stamps: (n,) in order.
+        values: (n, channels) NaN = missing.
+    """
+    equal = np.diff(stamps) == 0
+    shared = np.append(equal, False) | np.append(False, equal)  # not alone with its stamp
+    stamps, values = stamps[shared], values[shared]
+    if not len(stamps):
+        return 0
+    starts = np.flatnonzero(np.diff(stamps, prepend=stamps[:1] - 1) != 0)
+    group = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(stamps))))
+    differ = np.zeros(len(stamps), dtype=bool)
+    for c in range(values.shape[1]):  # column by column, to save memory
+        column = values[:, c]
+        last = merge_rows(column[:, None], starts, "last")[group, 0]
+        differ |= ~np.isnan(column) & (column != last)
+    return int(differ.sum())
+
+
 def merge_rows(
-    values: Values, starts: NDArray[np.int64], choice: Literal["last", "first", "mean", "refuse"]
+    values: Values,
+    starts: NDArray[np.int64],
+    choice: Literal["auto", "last", "first", "mean", "refuse"],
 ) -> Values:
     """One row per group of rows: the `last` or `first` known value per channel, or the `mean`.
 
     Args:
         values: (n, channels) NaN = missing.
         starts: (groups,) first row of each group, increasing from 0.
-        choice: which; `refuse` counts as `last`.
+        choice: which; `auto` and `refuse` count as `last`.
 
     Returns:
         (groups, channels).

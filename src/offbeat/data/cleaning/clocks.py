@@ -7,31 +7,60 @@ stamps are integers until the start is subtracted, and are converted to seconds 
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat.errors import FileFormatError, InputError, one_of
 
-NANOSECONDS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "100ns": 100, "ns": 1}
+NANOSECONDS_PER = {
+    "s": 1_000_000_000,
+    "ms": 1_000_000,
+    "us": 1_000,
+    "100ns": 100,
+    "ns": 1,
+    "min": 60_000_000_000,
+    "h": 3_600_000_000_000,
+    "d": 86_400_000_000_000,
+}
 """Units of time that a file may count in."""
 
 _SPELLINGS = {
     "s": ("s", "sec", "secs", "second", "seconds"),
-    "ms": ("ms", "msec", "millis", "millisecond", "milliseconds"),
-    "us": ("us", "µs", "usec", "micros", "microsecond", "microseconds"),
+    "ms": ("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"),
+    "us": ("us", "µs", "μs", "usec", "usecs", "micros", "microsec", "microsecond", "microseconds"),
     "100ns": ("100ns", "100 ns"),
-    "ns": ("ns", "nsec", "nanos", "nanosecond", "nanoseconds"),
+    "ns": ("ns", "nsec", "nsecs", "nanos", "nanosec", "nanosecs", "nanosecond", "nanoseconds"),
+    "min": ("min", "mins", "minute", "minutes"),
+    "h": ("h", "hr", "hrs", "hour", "hours"),
+    "d": ("d", "day", "days"),
 }
 _UNIT_OF = {spelling: unit for unit, names in _SPELLINGS.items() for spelling in names}
 
 _STEMS = ("time", "t", "timestamp", "stamp", "clock")
-TIME_NAMES = (*_STEMS, *(f"{stem}_{unit}" for stem in _STEMS for unit in NANOSECONDS_PER))
+_SHORT = ("s", "ms", "us", "100ns", "ns")
+_LONG = ("time", "timestamp", "elapsed")  # stems of minutes, hours, days: t_min is a minimum
+TIME_NAMES = (
+    *_STEMS,
+    *(f"{stem}_{unit}" for stem in _STEMS for unit in _SHORT),
+    *(f"{stem}_{unit}" for stem in _LONG for unit in ("min", "h", "d")),
+    *("times", "timestamps", "time_stamp", "datetime", "date_time", "elapsed", "elapsed_time"),
+    *("rosbag_timestamp", "ros_time", "header_stamp", "field_header_stamp", "log_time"),
+    *("epoch", "unix_time", "unixtime", "utc", "utc_time", "sec", "secs", "seconds"),
+)
 """Names of time columns, in any case; the first one in a file is used. Names with a
-unit give the unit, as do units in brackets, as in `t [ns]` and `Time (ms)`."""
+unit give the unit, as do units in brackets, as in `t [ns]` and `Time (ms)`. A point, a blank or a
+capital counts as `_`, so `TimeUS` is `time_us`; `#`, `%` and `_` before a name do not count."""
 
-_BRACKETS = re.compile(r"(.*?)\s+(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+_BRACKETS = re.compile(r"(.*?)(\s*)(?:\[([^\[\]]*)\]|\(([^()]*)\))")
+_WORDS = (
+    "s ms us µs μs ns sec secs seconds msec usec nsec min h hr d m mm cm um km in ft rad deg "
+    "degree degrees radians ° mrad v mv a ma n nm kn g kg mg hz khz mhz rpm w j pa kpa hpa bar "
+    "psi ut µt mt gauss degc degf c k °c °f % pct m/s km/h mph dps count counts lsb px n·m n*m"
+)
+_UNIT_WORDS = frozenset(_WORDS.split())
 _FIRST_YEAR, _LAST_YEAR = 946_684_800, 4_102_444_800  # 2000 and 2100, in seconds since 1970
 _EPOCHS = {  # units of clocks, and seconds from the clock's zero to 1970
     "seconds since 1970": ("s", 0),
@@ -47,29 +76,113 @@ _TYPICAL_HZ = 100.0
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Name and unit of a column: `speed [m/s]` is `("speed", "m/s")`; no unit is empty."""
+    """Name and unit of a column: `speed [m/s]` is `("speed", "m/s")`; no unit is empty.
+
+    Without a blank before the bracket, as in `speed(m/s)`, it must hold a known unit: `gyro[0]`,
+    `acc(x)` and `f(t)` are names.
+    """
     match = _BRACKETS.fullmatch(name.strip())
     if match is None or not match[1]:
         return name.strip(), ""
-    return match[1], (match[2] or match[3] or "").strip()
+    unit = (match[3] or match[4] or "").strip()
+    if not match[2] and not is_unit(unit):
+        return name.strip(), ""
+    return match[1], unit
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is a known unit, or a product, quotient or power of such."""
+    if text.casefold() in _UNIT_WORDS:
+        return True
+    parts = re.split(r"[/*·^\s\d\-+²³⁻¹]+", text.casefold())
+    known = [part for part in parts if part]
+    return len(parts) > 1 and bool(known) and all(part in _UNIT_WORDS for part in known)
+
+
+def folded(name: str) -> str:
+    """A column's name without its unit, as it is compared: `%TimeUS`, `time.us` are `time_us`."""
+    stem = split_unit(name)[0].lstrip("#%_ \t")
+    stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem)
+    return re.sub(r"[\s./:\-]+", "_", stem).strip("_").casefold()
 
 
 def time_unit_in(name: str) -> str | None:
-    """The unit in the name of a time column (`time_ms`, `t [ns]`), or None."""
-    stem, unit = split_unit(name)
-    text = unit.casefold() or stem.casefold().rpartition("_")[2]
-    return _UNIT_OF.get(text) if unit or "_" in stem else None
+    """The unit in the name of a time column (`time_ms`, `t [ns]`, `TimeUS`), or None."""
+    unit = split_unit(name)[1]
+    if unit:
+        return _UNIT_OF.get(unit.casefold())
+    stem, _, last = folded(name).rpartition("_")
+    if stem and (last not in ("d", "h", "min") or stem in _LONG):
+        return _UNIT_OF.get(last)
+    return "s" if last in ("sec", "secs", "seconds") else None
 
 
-def time_column_of(names: list[str]) -> str | None:
+def time_column_of(names: Sequence[str]) -> str | None:
     """The time column by its name, or None."""
-    stems = {name: split_unit(name)[0].casefold().lstrip("#").strip() for name in names}
+    stems: dict[str, str] = {}
+    for name in names:
+        stems.setdefault(folded(name), name)
     for usual in TIME_NAMES:
-        for name, stem in stems.items():
-            if stem == usual:
-                return name
-    spelt = (n for n, stem in stems.items() if time_unit_in(n) and stem.split("_")[0] in _STEMS)
-    return next(spelt, None)
+        if usual in stems:
+            return stems[usual]
+    for stem, name in stems.items():
+        if time_unit_in(name) and stem.split("_")[0] in _STEMS:
+            return name
+    # Such as host_timestamp; many names end in `time` and are durations.
+    return next((n for s, n in stems.items() if s.endswith(("_timestamp", "_stamp"))), None)
+
+
+_SPLIT = {"ns": 10**9, "us": 10**6, "ms": 10**3}  # counts of the second column per second
+
+
+def split_stamps(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Pairs of columns that may hold a stamp together: seconds, the rest, and unit of the rest.
+
+    Such as `sec` and `nanosec`, `stamp.secs` and `stamp.nsecs`, `time_s` and `time_us`.
+    """
+    wholes: dict[str, str] = {}
+    for name in names:
+        stem, _, last = folded(name).rpartition("_")
+        if _UNIT_OF.get(last) == "s":
+            wholes.setdefault(stem, name)
+    found = []
+    for name in names:
+        stem, _, last = folded(name).rpartition("_")
+        unit = _UNIT_OF.get(last, "")
+        if unit in _SPLIT and stem in wholes:
+            found.append((wholes[stem], name, unit))
+    return found
+
+
+def is_rest(whole: ArrayLike, rest: ArrayLike, unit: str) -> bool:
+    """Whether numbers are whole seconds and, beside them, what is left of each in `unit`."""
+    seconds, left = np.asarray(whole, dtype=np.float64), np.asarray(rest, dtype=np.float64)
+    if not seconds.size or seconds.shape != left.shape:
+        return False
+    fits = (seconds == np.floor(seconds)) & (left == np.floor(left)) & (left >= 0)
+    return bool((fits & (left < _SPLIT[unit])).all())
+
+
+def join_stamp(whole: NDArray[Any], rest: NDArray[Any], unit: str) -> NDArray[np.int64]:
+    """Integer nanoseconds of a stamp in two columns.
+
+    Args:
+        whole: (n,) seconds.
+        rest: (n,) what is left of each, in `unit`.
+        unit: `ns`, `us` or `ms`.
+
+    Raises:
+        FileFormatError: they are no such numbers.
+    """
+    if not is_rest(whole, rest, unit):
+        raise FileFormatError(
+            f"a stamp in two columns must be whole seconds, and from 0 to {_SPLIT[unit] - 1} "
+            f"{unit}; name the column of the time with time_column"
+        )
+    seconds, left = np.asarray(whole).astype(np.int64), np.asarray(rest).astype(np.int64)
+    if int(np.abs(seconds).max()) >= 2**63 // 10**9:
+        raise FileFormatError("times in seconds exceed 292 years; name the column of the time")
+    return seconds * 10**9 + left * (10**9 // _SPLIT[unit])
 
 
 def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
@@ -110,9 +223,21 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
     )
 
 
-def state_time_unit(
-    given: str | None, name: str, clock: ArrayLike, where: str
-) -> tuple[str, tuple[str, ...]]:
+class TimeUnit(NamedTuple):
+    """The unit of a clock.
+
+    Attributes:
+        unit: one of `NANOSECONDS_PER`.
+        notes: on a unit that was found or assumed, or that is not the one of the name.
+        found: whether nothing states the unit: it was found from the numbers, or assumed.
+    """
+
+    unit: str
+    notes: tuple[str, ...]
+    found: bool = False
+
+
+def state_time_unit(given: str | None, name: str, clock: ArrayLike, where: str) -> TimeUnit:
     """The unit of a clock: as given, else from its name, else detected from its numbers.
 
     Args:
@@ -121,27 +246,42 @@ def state_time_unit(
         clock: (n,) some of its numbers.
         where: the file, for messages.
 
-    Returns:
-        The unit, and notes on a detected unit.
-
     Raises:
-        InputError: the given unit is unknown, or the name has another one.
+        InputError: the given unit is unknown.
     """
     named = time_unit_in(name)
     if given is not None:
-        one_of("time unit", given, NANOSECONDS_PER)
+        try:
+            one_of("time unit", given, NANOSECONDS_PER)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
         if named not in (None, given):
-            raise InputError(
-                f"{where}: the column {name!r} says that times are in {named}, time_unit says "
-                f"{given}; leave time_unit out, or rename the column"
+            return TimeUnit(
+                given, (f"times are read in {given}, as time_unit says, not as {name!r} does",)
             )
-        return given, ()
+        return TimeUnit(given, ())
     if named is not None:
-        return named, ()
-    found, why = find_time_unit(clock)
-    if not why:
-        return found, ()
-    return found, (f"time is taken to be in {found}: {why}; state it with time_unit",)
+        return TimeUnit(named, ())
+    unit, why = find_time_unit(clock)
+    if why:
+        return TimeUnit(
+            unit, (f"time is taken to be in {unit}: {why}; state it with time_unit",), True
+        )
+    numbers = np.asarray(clock, dtype=np.float64)
+    steps = np.diff(numbers[np.isfinite(numbers)])
+    steps = steps[steps > 0]
+    if len(steps) >= 3 and (steps == np.floor(steps)).all():
+        step = float(np.median(steps))
+        return TimeUnit(
+            unit,
+            (
+                f"time is taken to be in s, a row every {step:g} s: {name!r} holds whole numbers "
+                f"and names no unit; if they count ms ({1000 / step:.4g} Hz), or anything else, "
+                "state it with time_unit",
+            ),
+            True,
+        )
+    return TimeUnit(unit, (), True)
 
 
 def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], int]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from offbeat.data.cleaning.channels import find_quaternions
+from offbeat.data.cleaning.log import listed
 from offbeat.data.cleaning.options import ReaderOptions
-from offbeat.data.signals import Recording, Signal
+from offbeat.data.signals import MOST_CHANNELS, Recording, Signal
 from offbeat.data.transforms import full_turn
 from offbeat.errors import FileFormatError, InputError, one_of
 
@@ -22,6 +26,7 @@ class Channels:
     columns: dict[tuple[str, str], int]  # by signal and channel
     angles: dict[int, float]  # full turn of each, in its unit
     quaternions: tuple[tuple[int, ...], ...]
+    degrees: tuple[str, ...] = ()  # angles without a unit that were found to be in degrees
 
     @classmethod
     def of(cls, recordings: list[Recording], options: ReaderOptions) -> Channels:
@@ -38,6 +43,7 @@ class Channels:
         kinds: list[str] = []
         roles: list[str] = []
         looked_at: set[str] = set()
+        degrees: list[str] = []
         for signal in (signal for recording in recordings for signal in recording.signals):
             for channel, unit, kind, role in zip(
                 signal.channels, signal.units, signal.kinds, signal.roles, strict=True
@@ -62,21 +68,43 @@ class Channels:
                             kinds[columns[signal.name, channel]] = "quaternion"
         several = len({signal for signal, _ in columns}) > 1
         names = tuple(f"{s}.{c}" if several and s else c for s, c in columns)
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
+        place = {name: i for i, name in enumerate(names)}
+        if len(place) < len(names):
+            twice = next(name for i, name in enumerate(names) if place[name] != i)
             raise FileFormatError(f"two channels have the name {twice!r}; names must be unique")
         if not names:
             raise FileFormatError("there is no channel to read, only times")
+        if len(names) > MOST_CHANNELS:
+            raise FileFormatError(
+                f"there are {len(names)} channels, more than {MOST_CHANNELS} that can be read at "
+                "once; choose some with channels="
+            )
+
+        def known(what: str, name: str) -> int:
+            return place[name if name in place else one_of(what, name, names)]
+
         for option, role in (("actions", "action"), ("exogenous", "exogenous")):
             for name in getattr(options, option):
-                roles[names.index(one_of(f"channel in {option}", name, names))] = role
+                roles[known(f"channel in {option}", name)] = role
+        for name, unit in (options.units or {}).items():
+            units[known("channel in units", name)] = unit
         for name in options.angles:
-            kinds[names.index(one_of("channel in angles", name, names))] = "angle"
-        left_out = {one_of("channel in without", name, names) for name in options.without}
+            at = known("channel in angles", name)
+            kinds[at] = "angle"
+            if not units[at] and _is_in_degrees(name, columns, at, recordings):
+                units[at] = "deg"
+                degrees.append(name)
+        gone = {name for recording in recordings for name in recording.left_out}
+        left_out = {
+            name for name in options.without
+            if name in place or (name not in gone and one_of("channel in without", name, names))
+        }  # fmt: skip
         chosen = tuple(name for name in options.channels or names if name not in left_out)
         if not chosen:
-            raise InputError(f"there are no channels but those to be left out: {', '.join(names)}")
-        kept = {names.index(one_of("channel", name, names)): i for i, name in enumerate(chosen)}
+            raise InputError(
+                f"there are no channels but those to be left out: {listed(list(names))}"
+            )
+        kept = {known("channel", name): i for i, name in enumerate(chosen)}
         fours = [at for at, kind in enumerate(kinds) if kind == "quaternion"]
         whole = [fours[i : i + 4] for i in range(0, len(fours), 4)]
         return cls(
@@ -95,6 +123,7 @@ class Channels:
                 if options.quaternions == "continuous"
                 and all(at in kept and roles[at] != "action" for at in four)
             ),
+            tuple(degrees),
         )
 
     def keep(self, signal: Signal) -> Signal | None:
@@ -108,3 +137,35 @@ class Channels:
     def names_of(self, columns: Iterable[int]) -> tuple[str, ...]:
         """The names of some columns."""
         return tuple(self.names[c] for c in columns)
+
+
+def _is_in_degrees(
+    name: str, columns: dict[tuple[str, str], int], at: int, recordings: list[Recording]
+) -> bool:
+    """Whether an angle that states no unit is in degrees, by its range and its jumps.
+
+    Values within 2 pi of 0 are radians. Wider ones are degrees if they are within 360 of 0 and
+    jump by more than 180.
+
+    Raises:
+        InputError: it may be either.
+    """
+    values = [
+        signal.values[:, i][~np.isnan(signal.values[:, i])]
+        for recording in recordings
+        for signal in recording.signals
+        for i, channel in enumerate(signal.channels)
+        if columns[signal.name, channel] == at
+    ]
+    low = min((float(v.min()) for v in values if v.size), default=0.0)
+    high = max((float(v.max()) for v in values if v.size), default=0.0)
+    turn = 2 * math.pi * 1.001
+    if -turn <= low and high <= turn:
+        return False
+    jumps = any(bool((np.abs(np.diff(v)) > 180).any()) for v in values)
+    if jumps and low >= -360.5 and high <= 360.5:
+        return True
+    raise InputError(
+        f"the angle {name!r} has no unit, and values from {low:.4g} to {high:.4g} may be rad or "
+        f"deg; state it with units={{{name}: deg}}"
+    )

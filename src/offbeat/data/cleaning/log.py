@@ -25,6 +25,7 @@ class CleaningLog:
         empty: recordings without a row.
         infinite: infinite values.
         outliers: values that are no measurements, see `offbeat.data.outliers`.
+        replaced: numbers that stand for a missing value.
         repeated: of each channel with repeated values, their fraction and the rows per value.
         masked: repeated values that no longer count as measured.
         turns: jumps by a turn that were removed from each angle.
@@ -45,6 +46,7 @@ class CleaningLog:
     empty: int = 0
     infinite: int = 0
     outliers: list[dict[str, Any]] = field(default_factory=list)
+    replaced: int = 0
     repeated: dict[str, dict[str, float]] = field(default_factory=dict)
     masked: int = 0
     turns: Counter[str] = field(default_factory=Counter)
@@ -86,6 +88,7 @@ class CleaningLog:
             },
             "infinite": {"option": o.infinite, "values": self.infinite},
             "outliers": {"option": o.outliers, "found": self.outliers},
+            "missing": {"numbers": list(o.missing), "values": self.replaced},
             "repeated": {"option": o.repeated, "channels": self.repeated, "masked": self.masked},
             "angles": {
                 "unwrap": o.unwrap,
@@ -131,9 +134,8 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
         what = {"sort": "sorted", "drop": "dropped"}.get(order["option"], order["option"])
         lines.append(f"{_rows(order['late'])} came late and {_were(order['late'])} {what}")
     if duplicates["rows"]:
-        how = {"mean": "the mean of the known values"}.get(
-            duplicates["option"], f"the {duplicates['option']} known value"
-        )
+        option = {"auto": "last"}.get(duplicates["option"], duplicates["option"])
+        how = {"mean": "the mean of the known values"}.get(option, f"the {option} known value")
         lines.append(
             f"{_rows(duplicates['rows'])} had the time stamp of another row; {how} of each channel "
             "was kept"
@@ -156,7 +158,8 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
             f"({_rows(left['rows'])})"
         )
     if left["without_rows"]:
-        lines.append(f"{left['without_rows']} recordings without a row were left out")
+        what = "1 recording" if left["without_rows"] == 1 else f"{left['without_rows']} recordings"
+        lines.append(f"{what} without a row {_were(left['without_rows'])} left out")
     if cleaning["infinite"]["values"]:
         lines.append(f"{cleaning['infinite']['values']} infinite values count as missing")
     outliers = cleaning.get("outliers", {"found": ()})  # data sets of 0.2.0 have none
@@ -174,6 +177,9 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
             f"{'1 value' if values == 1 else f'{values} values'} of {listed(names)} are no "
             f"measurements; {done}"
         )
+    if cleaning.get("missing", {}).get("values"):
+        what = ", ".join(f"{number:g}" for number in cleaning["missing"]["numbers"])
+        lines.append(f"{cleaning['missing']['values']} values of {what} count as missing")
     repeated = cleaning["repeated"]
     if repeated["channels"]:
         done = (

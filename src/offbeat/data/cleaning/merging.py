@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning import anomalies
 from offbeat.data.cleaning.described import Channels
-from offbeat.data.cleaning.log import CleaningLog
+from offbeat.data.cleaning.log import CleaningLog, listed
 from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.trajectory import Trajectory
 from offbeat.errors import FileFormatError, InputError
+
+_FEW, _ONE_IN = 2, 20  # rows that may lose a value to another one of their stamp, or a fraction
+_DAY = 86_400 * 10**9
 
 
 @dataclass
@@ -72,6 +75,7 @@ def cut(
         hand_over(signal.values)  # cleaning copies the values first
     kept = [channels.keep(signal) for signal in recording.signals if len(signal.stamps)]
     signals = [signal for signal in kept if signal is not None]
+    _note_apart(signals, log)
     if not signals:
         log.empty += 1
         return []
@@ -111,6 +115,28 @@ def cut(
     for k, episode in enumerate(long, 1):
         episode.part = str(k)
     return long
+
+
+def _note_apart(signals: list[Signal], log: CleaningLog) -> None:
+    """Notes signals whose clock is more than a day away from that of all others."""
+    if len(signals) < 2:
+        return
+    spans = sorted(
+        ((int(s.stamps.min()), int(s.stamps.max()), s) for s in signals), key=lambda span: span[:2]
+    )
+    latest = spans[0][1]
+    for i, (first, last, _) in enumerate(spans[1:], 1):
+        if first - latest > _DAY:
+            names = [
+                listed([s.name or ", ".join(s.channels[:1]) for _, _, s in part])
+                for part in (spans[:i], spans[i:])
+            ]
+            log.notes[
+                f"the clocks of {names[0]} and of {names[1]} have no time in common: they are "
+                f"{(first - latest) / 1e9:.3g} s apart"
+            ] = None
+            return
+        latest = max(latest, last)
 
 
 def _anomalies_in(
@@ -185,6 +211,14 @@ def _ordered(
         log.late[name] += len(found.late)
     stamps, values = anomalies.in_order(signal.stamps, signal.values, options.order)
     before = len(stamps)
+    if options.duplicates == "auto" and len(found.duplicates) > max(_FEW, before // _ONE_IN):
+        lost = anomalies.rows_that_differ(stamps, values)
+        if lost > max(_FEW, before // _ONE_IN):
+            raise FileFormatError(
+                f"{_where(signal, recording)}{lost} of {before} rows have the time stamp of "
+                "another row and other values. Name the column of the time, or of the instance or "
+                "trajectory of each row; duplicates=last (or first, mean) merges such rows"
+            )
     stamps, values = anomalies.one_row_per_stamp(stamps, values, options.duplicates)
     if before > len(stamps):
         log.duplicates[name] += before - len(stamps)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -28,7 +28,9 @@ class ReaderOptions:
         order: rows whose time stamp is lower than one before it: `sort` them, `drop` them, or
             `refuse` the file.
         duplicates: of several known values of a channel at one time stamp, keep the `last` or the
-            `first` one logged, or their `mean`, or `refuse` the file.
+            `first` one logged, or their `mean`, or `refuse` the file. `auto` keeps the last one,
+            and refuses a file in which more than one row in 20 would lose a value: its time stamps
+            are not those of its rows, or several sensors share them.
         clock_jumps: where a clock was set back, or forward by more than a day, while it was logged:
             `split` into episodes, `join` as if rows were out of order, or `refuse` the file.
         max_gap_s: s, a longer time without any row is an outage, where episodes are split. `auto`
@@ -45,6 +47,8 @@ class ReaderOptions:
         quaternions: `continuous` gives each row the sign that is nearer to the row before (q and -q
             are one rotation) and length 1, and treats one of length 0 as missing; `keep` does not
             change them.
+        units: unit of a channel by its name, in place of what the file says.
+        missing: numbers that stand for a value that is not known, such as -999.
         infinite: treat an infinite value as `missing`, or `refuse` the file.
         outliers: values that are no measurements, such as -999 or 1e30 far from all others, zeros
             before the first measurement, and spikes (see `offbeat.data.outliers`): `keep` them, or
@@ -63,7 +67,7 @@ class ReaderOptions:
     actions: tuple[str, ...] = ()
     exogenous: tuple[str, ...] = ()
     order: Literal["sort", "drop", "refuse"] = "sort"
-    duplicates: Literal["last", "first", "mean", "refuse"] = "last"
+    duplicates: Literal["auto", "last", "first", "mean", "refuse"] = "auto"
     clock_jumps: Literal["split", "join", "refuse"] = "split"
     max_gap_s: float | Literal["auto"] | None = "auto"
     min_rows: int = 2
@@ -71,6 +75,8 @@ class ReaderOptions:
     unwrap: bool = True
     angles: tuple[str, ...] = ()
     quaternions: Literal["continuous", "keep"] = "continuous"
+    units: Mapping[str, str] | None = None
+    missing: tuple[str | float, ...] = ()
     infinite: Literal["missing", "refuse"] = "missing"
     outliers: Literal["keep", "mask"] = "keep"
     start: Literal["first_row", "clock"] = "first_row"
@@ -80,11 +86,11 @@ class ReaderOptions:
         for name, choices in _CHOICES.items():
             one_of(name, getattr(self, name), choices)
         gap, rate = self.max_gap_s, self.resample_hz
-        if gap not in ("auto", None) and not (_is_number(gap) and gap > 0):  # type: ignore[operator]
+        if gap not in ("auto", None) and not (is_number(gap) and gap > 0):  # type: ignore[operator]
             raise InputError(
                 f"max_gap_s must be seconds above 0, 'auto', or None to never split, got {gap!r}"
             )
-        if rate is not None and not (_is_number(rate) and 0 < rate <= 1e9):
+        if rate is not None and not (is_number(rate) and 0 < rate <= 1e9):
             raise InputError(
                 f"resample_hz must be above 0 and at most 1e9, or None to leave the rows where "
                 f"they are, got {rate!r}"
@@ -98,9 +104,19 @@ class ReaderOptions:
         ):
             if names is None:
                 continue
-            if isinstance(names, str) or not all(isinstance(one, str) for one in names):
+            if (
+                isinstance(names, str | Mapping)
+                or not isinstance(names, Iterable)
+                or not all(isinstance(one, str) for one in names)
+            ):
                 raise InputError(f"{name} must be names of channels, got {names!r}")
             object.__setattr__(self, name, tuple(dict.fromkeys(names)))
+        object.__setattr__(self, "missing", _numbers(self.missing))
+        units = {} if self.units is None else self.units
+        if not isinstance(units, Mapping) or not all(
+            isinstance(text, str) for pair in units.items() for text in pair
+        ):
+            raise InputError(f"units must map names of channels to units, got {units!r}")
         if self.channels == ():
             raise InputError("channels must name at least one channel, or be None to keep all")
         if not isinstance(self.unwrap, bool):
@@ -113,7 +129,7 @@ class ReaderOptions:
 
 _CHOICES: Mapping[str, tuple[str, ...]] = {
     "order": ("sort", "drop", "refuse"),
-    "duplicates": ("last", "first", "mean", "refuse"),
+    "duplicates": ("auto", "last", "first", "mean", "refuse"),
     "clock_jumps": ("split", "join", "refuse"),
     "repeated": ("keep", "mask"),
     "quaternions": ("continuous", "keep"),
@@ -123,7 +139,28 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, and no boolean."""
     return (
         isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
     )
+
+
+def _numbers(given: Any) -> tuple[float, ...]:
+    """The numbers of the option `missing`, which may be given as texts.
+
+    Raises:
+        InputError: it is something else.
+    """
+    listed = (given,) if isinstance(given, str | float | int) else given
+    if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
+        raise InputError(f"missing must be numbers such as -999, got {given!r}")
+    found: list[float] = []
+    for one in listed:
+        try:
+            found.append(float(one))
+        except (TypeError, ValueError):
+            raise InputError(
+                f"missing must be numbers such as -999, got {one!r}; texts are an option of CSV"
+            ) from None
+    return tuple(found)

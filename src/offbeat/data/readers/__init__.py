@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import logging
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, 
 from offbeat.data.recording import ReaderOptions, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
-from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.errors import FileFormatError, InputError, OffbeatError, one_of, printable
 from offbeat.registry import Registry
 
 FOLDER = "/"
@@ -132,8 +133,13 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
         if not reader.options:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
         one_of(f"option of the {reader.name} reader", option, reader.options)
-    own = {name: options.pop(name) for name in reader.own_options if name in options}
-    made = reader.function(path, **own)
+    own = {name: options[name] for name in reader.own_options if name in options}
+    # Columns are left out by name, and texts of missing values are replaced, before the cleaning.
+    if "missing" in own:
+        options["missing"] = [m for m in _several(own["missing"]) if _is_number(m)]
+        own["missing"] = [m for m in _several(own["missing"]) if not _is_number(m)]
+    options = {n: v for n, v in options.items() if n not in own or n in ("without", "missing")}
+    made = _made(reader, path, own)
     if isinstance(made, Dataset):
         if options:
             raise InputError(
@@ -141,10 +147,43 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
                 f"got the options {', '.join(options)}"
             )
         return made
-    dataset = assemble(made, ReaderOptions(**options))
+    dataset = assemble(_handed_over(made), ReaderOptions(**options))
     for note in dataset.meta["cleaning"]["notes"]:
-        logging.getLogger("offbeat").warning("%s: %s", path, note)
+        logging.getLogger("offbeat").warning("%s: %s", printable(str(path)), printable(note))
     return replace(dataset, meta={"source": path.name, "format": reader.name, **dataset.meta})
+
+
+def _made(reader: Reader, path: Path, own: dict[str, Any]) -> list[Recording] | Dataset:
+    """What a reader gives; the errors of libraries about a damaged file in one line."""
+    try:
+        made = reader.function(path, **own)
+        return made if isinstance(made, Dataset) else list(made)
+    except OffbeatError:
+        raise
+    except Exception as error:
+        what = " ".join(str(error).split())[:120]
+        raise FileFormatError(
+            f"{path} can't be read as {reader.name}, it is truncated, damaged or of another format "
+            f"({type(error).__name__}: {what}); copy it again"
+        ) from error
+
+
+def _handed_over(made: list[Recording]) -> Iterable[Recording]:
+    """Yields recordings and keeps none, so that each is freed once it is merged."""
+    made.reverse()
+    while made:
+        yield made.pop()
+
+
+def _several(given: Any) -> list[Any]:
+    return [given] if isinstance(given, str | int | float) else list(given)
+
+
+def _is_number(given: Any) -> bool:
+    try:
+        return not isinstance(given, bool) and math.isfinite(float(given))
+    except (TypeError, ValueError):
+        return False
 
 
 def _renamed(options: dict[str, Any], reader: Reader) -> dict[str, Any]:

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.cleaning.clocks import join_stamp
 from offbeat.data.readers.columns import Coded, Coder, Columns, Gathered
+from offbeat.data.readers.stamps import date_and_time, over_midnight, stamps_of
 from offbeat.errors import FileFormatError
 
 
@@ -64,10 +66,32 @@ def gather(
     )
 
 
+def with_joined(batches: Iterable[Any], columns: Columns) -> Iterator[Any]:
+    """Batches with nanoseconds in place of the whole seconds of a stamp in two columns.
+
+    Raises:
+        NullValueError: a part is missing.
+        FileFormatError: the parts are no such numbers.
+    """
+    import pyarrow as pa
+
+    start = 0
+    for batch in batches:
+        whole, rest = (
+            clock_of(_without_nulls(batch.column(name), name, start))
+            for name in (columns.time, columns.rest or "")
+        )
+        start += batch.num_rows
+        if not batch.num_rows:
+            continue
+        stamps = pa.array(join_stamp(whole, rest, columns.rest_unit))
+        yield batch.set_column(batch.schema.get_field_index(columns.time), columns.time, stamps)
+
+
 def gather_columns(
     sources: Sequence[Callable[[str], Iterable[Any]]],
     columns: Columns,
-    rows: int,
+    clock: NDArray[Any],
     *,
     widths: Mapping[str, int] = MappingProxyType({}),
 ) -> Gathered:
@@ -79,13 +103,13 @@ def gather_columns(
         sources: functions that return the Arrow arrays of a column of the same file; one thread
             each.
         columns: description of the columns.
-        rows: their length.
+        clock: (rows,) the times, of `clock_of_columns`.
         widths: number of channels of each column of lists.
 
     Raises:
         NullValueError, FileFormatError, OverflowError: as `gather`.
     """
-    clock = np.concatenate([clock_of(c) for c in _known(sources[0](columns.time), columns.time)])
+    rows = len(clock)
     coded: list[Coded | None] = []
     for name in (columns.label, columns.key):
         coder = Coder()
@@ -110,6 +134,61 @@ def gather_columns(
         for _ in pool.map(fill, range(len(sources))):
             pass  # raises the errors of threads
     return Gathered(clock, coded[0], coded[1], values.T)
+
+
+def clock_of_columns(
+    source: Callable[[str], Iterable[Any]], columns: Columns, form: str | None
+) -> NDArray[Any]:
+    """The times of a table whose columns can be read one by one, as integers or floats.
+
+    Those of texts, dates, times of day and stamps in two columns are nanoseconds.
+
+    Args:
+        source: returns the Arrow arrays of a column.
+        columns: description of the columns.
+        form: of times as text.
+
+    Raises:
+        NullValueError: a time is missing.
+        FileFormatError: two columns do not hold a stamp.
+        ArrowInvalid: a text is no time.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    chunks = [c for c in _known(source(columns.time), columns.time) if len(c)]
+    if not chunks:
+        return np.zeros(0, dtype=np.int64)
+    kind = chunks[0].type
+    if columns.rest is not None:
+        others = [c for c in _known(source(columns.rest), columns.rest) if len(c)]
+        if columns.rest_unit != "date":
+            whole, rest = (np.concatenate([clock_of(c) for c in part]) for part in (chunks, others))
+            return join_stamp(whole, rest, columns.rest_unit)
+        if not is_text(kind):
+            chunks = [pc.strftime(c, "%Y-%m-%d") for c in chunks]
+            form = "without"
+        both = zip(chunks, map(_text, others), strict=True)
+        return np.concatenate([clock_of(date_and_time(d, t, form or "without")) for d, t in both])
+    if is_text(kind):
+        stamps = [stamps_of(pc.utf8_trim_whitespace(_text(c)), form or "without") for c in chunks]
+        clock = np.concatenate([clock_of(c) for c in stamps])
+        return over_midnight(clock) if form == "of day" else clock
+    if pa.types.is_date(kind):
+        chunks = [c.cast(pa.timestamp("ns")) for c in chunks]
+    if pa.types.is_time(kind):
+        clock = np.concatenate([clock_of(c.cast(pa.time64("ns"))) for c in chunks])
+        return over_midnight(clock)
+    return np.concatenate([clock_of(c) for c in chunks])
+
+
+def is_text(kind: Any) -> bool:
+    """Whether an Arrow type is one of texts."""
+    import pyarrow as pa
+
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
 
 def _known(chunks: Iterable[Any], name: str) -> Iterator[Any]:

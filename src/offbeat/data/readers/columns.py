@@ -6,17 +6,29 @@ channel, value), and holds one recording or, by a column of labels, several.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import TIME_NAMES, split_unit, time_column_of, to_nanoseconds
-from offbeat.data.recording import Recording, Signal
-from offbeat.errors import FileFormatError, one_of
+from offbeat.data.cleaning.clocks import (
+    TIME_NAMES,
+    folded,
+    is_rest,
+    split_stamps,
+    split_unit,
+    time_column_of,
+    to_nanoseconds,
+)
+from offbeat.data.cleaning.options import is_number
+from offbeat.data.readers.options import names as names_of
+from offbeat.data.readers.stamps import form_of
+from offbeat.data.signals import MOST_CHANNELS, Recording, Signal
+from offbeat.errors import FileFormatError, InputError, one_of
 
 LABEL_NAMES = ("trajectory", "episode", "episode_index", "demo")
 """Names of trajectory columns, in any case."""
@@ -26,18 +38,74 @@ VALUE_NAMES = ("value", "val", "data", "reading")
 """Names of the two columns of long tables besides the time, in any case."""
 
 
+INSTANCE_NAMES = ("i", "instance", "multi_id", "sensor_id", "imu_id", "imu", "id", "index")
+"""Names of columns with the number of the sensor of a row, in any case."""
+
+_MOST_INSTANCES = 64
+
+
+class Sample(Protocol):
+    """The first values of the columns of a table, from which their meaning is found."""
+
+    def is_text(self, name: str) -> bool:
+        """Whether a column holds texts, and not numbers or booleans."""
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """The first numbers of a column, NaN where there is none; empty for texts."""
+
+    def texts(self, name: str) -> list[str]:
+        """The first values of a column, as texts."""
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """The options that say what the columns of a table mean; see `read_csv`."""
+
+    time_column: str | Sequence[str] | None = None
+    trajectory_column: str | None = None
+    channels: Sequence[str] | None = None
+    without: Sequence[str] = ()
+    units: Mapping[str, str] | None = None
+    channel_column: str | None = None
+    value_column: str | None = None
+    instance_column: str | None = None
+    rate_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "channels", names_of("channels", self.channels))
+        object.__setattr__(self, "without", names_of("without", self.without or None) or ())
+        for name in ("trajectory_column", "channel_column", "value_column", "instance_column"):
+            given = getattr(self, name)
+            if not (given is None or isinstance(given, str)):
+                raise InputError(f"{name} must be the name of a column, got {given!r}")
+        units = self.units or {}
+        if not isinstance(units, Mapping) or not all(
+            isinstance(text, str) for pair in units.items() for text in pair
+        ):
+            raise InputError(f"units must map names of channels to units, got {units!r}")
+        rate = self.rate_hz
+        if rate is not None and not (is_number(rate) and 0 < rate <= 1e9):
+            raise InputError(f"rate_hz must be rows per second, above 0, got {rate!r}")
+
+
 @dataclass(frozen=True)
 class Columns:
     """The meaning of each column of a table.
 
     Attributes:
-        time: the column of times.
+        time: the column of times; empty where rows have a fixed rate.
         label: the column of labels, or None.
         channels: the columns of channels; in a long table, the column of values.
         names: of the channels, without units.
         units: of the channels.
-        key: in a long table, the column with the channel of each value.
+        key: the column with the channel of each value in a long table, or with the sensor that each
+            row is of.
         chosen: in a long table, the selected channels, or None.
+        stated: in a table with a key, units by channel.
+        rest: the second column of a stamp in two columns, or None.
+        rest_unit: its unit, or `date` where `rest` is a time of day and `time` is the date.
+        left_out: names of columns that are there and not read.
+        notes: on what was found and left out.
     """
 
     time: str
@@ -48,93 +116,227 @@ class Columns:
     key: str | None = None
     chosen: tuple[str, ...] | None = None
     stated: Mapping[str, str] = field(default_factory=dict)
+    rest: str | None = None
+    rest_unit: str = ""
+    left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
-        cls,
-        path: Path,
-        header: Sequence[str],
-        *,
-        time_column: str | None = None,
-        trajectory_column: str | None = None,
-        channels: Sequence[str] | None = None,
-        units: Mapping[str, str] | None = None,
-        channel_column: str | None = None,
-        value_column: str | None = None,
+        cls, path: Path, header: Sequence[str], options: TableOptions, sample: Sample
     ) -> Columns:
-        """Determines the meaning of each column, from options or names.
+        """Determines the meaning of each column, from options, names and first values.
 
         Raises:
-            FileFormatError: there is no time or no channel.
+            FileFormatError: there is no time or no channel, or the stamp stands in several columns.
             InputError: an option names an unknown column.
         """
         names = list(header)
-        time = time_column_of(names) if time_column is None else _named(time_column, names, "time")
-        if time is None:
-            raise FileFormatError(
-                f"{path} has no column of times: its columns must have one of the names "
-                f"{', '.join(TIME_NAMES[:3])}, ... got {listed(names)}; say which one with "
-                "time_column="
-            )
-        others = [name for name in names if name != time]
-        folded = {name.casefold(): name for name in reversed(others)}
-        label = next((folded[name] for name in LABEL_NAMES if name in folded), None)
-        if trajectory_column is not None:
-            label = _named(trajectory_column, others, "trajectory")
+        stamp = stamp_columns(path, names, options, sample)
+        used = {stamp.time, stamp.rest}
+        others = [name for name in names if name not in used]
+        first_of: dict[str, str] = {}
+        for name in others:
+            first_of.setdefault(name.casefold(), name)
+        label = next((first_of[name] for name in LABEL_NAMES if name in first_of), None)
+        if options.trajectory_column is not None:
+            label = _named(options.trajectory_column, others, "trajectory")
         rest = [name for name in others if name != label]
         if not rest:
             raise FileFormatError(
                 f"{path} has no channels, only the columns {listed(names)}; it needs one column "
                 "per channel besides the time"
             )
-        key, value = _long_form(rest, channel_column, value_column)
+        found = replace(stamp, label=label)
+        key, value = _long_form(rest, options, sample)
         if key is not None and value is not None:
-            chosen = None if channels is None else tuple(dict.fromkeys(channels))
-            return cls(
-                time, label, (value,), (value,), ("",), key, chosen, stated=dict(units or {})
+            return replace(
+                found,
+                channels=(value,),
+                names=(value,),
+                units=("",),
+                key=key,
+                chosen=None if options.channels is None else tuple(options.channels),
+                stated=dict(options.units or {}),
             )
-        return cls._wide(time, label, rest, channels, dict(units or {}))
+        key = _instance_column(found, rest, options, sample)
+        if key is not None:
+            found = replace(
+                found,
+                key=key,
+                stated=dict(options.units or {}),
+                notes=(*found.notes, f"rows are of the sensor in column {key!r}: each has channels "
+                       "of its own"),
+            )  # fmt: skip
+            options = replace(options, units=None)
+            rest = [name for name in rest if name != key]
+        return found._wide(path, rest, options, sample)
 
-    @classmethod
     def _wide(
-        cls,
-        time: str,
-        label: str | None,
-        columns: list[str],
-        channels: Sequence[str] | None,
-        stated: dict[str, str],
+        self, path: Path, columns: list[str], options: TableOptions, sample: Sample
     ) -> Columns:
         split = [split_unit(column) for column in columns]
         short = [name for name, _ in split]
         if len(set(short)) < len(short):
-            short = columns
+            short = list(columns)
         units = {n: unit for n, c, (_, unit) in zip(short, columns, split, strict=True) if n != c}
         column_of = dict(zip(columns, columns, strict=True)) | dict(
             zip(short, columns, strict=True)
         )
         name_of = dict(zip(columns, short, strict=True))
-        names = short
-        if channels is not None:
-            asked = dict.fromkeys(
-                column_of[name if name in column_of else one_of("channel", name, short)]
-                for name in channels
-            )
-            columns, names = list(asked), [name_of[column] for column in asked]
+        stated = dict(options.units or {})
         for name in stated:
-            one_of("channel in units", name, names)
-        return cls(
-            time,
-            label,
-            tuple(columns),
-            tuple(names),
-            tuple(stated.get(name, units.get(name, "")) for name in names),
+            if name not in name_of.values():
+                one_of("channel in units", name, short)
+        notes: tuple[str, ...] = ()
+        left: list[str] = []
+        if options.channels is not None:
+            kept = list(
+                dict.fromkeys(
+                    column_of[name if name in column_of else one_of("channel", name, short)]
+                    for name in options.channels
+                )
+            )
+            for column in kept:
+                if sample.is_text(column):
+                    raise FileFormatError(
+                        f"{path} has text in column {column!r}, such as "
+                        f"{_first(sample.texts(column))!r}, expected numbers; choose other columns "
+                        "with channels="
+                    )
+        else:
+            without = {column_of[name] for name in options.without if name in column_of}
+            texts = [c for c in columns if c not in without and sample.is_text(c)]
+            left = [*without, *texts]
+            gone = set(left)
+            kept = [column for column in columns if column not in gone]
+            if texts:
+                notes = (f"columns of text are left out: {listed(texts, 6)}",)
+            if not kept:
+                raise FileFormatError(
+                    f"{path} has no column of numbers besides the time, expected one per channel; "
+                    f"left out: {listed(left, 6)}"
+                    + (
+                        f", with text such as {_first(sample.texts(texts[0]))[:60]!r}"
+                        if texts
+                        else ""
+                    )
+                )
+        return replace(
+            self,
+            channels=tuple(kept),
+            names=tuple(name_of[c] for c in kept),
+            units=tuple(stated.get(name_of[c], units.get(name_of[c], "")) for c in kept),
+            left_out=tuple(dict.fromkeys([*left, *(name_of[c] for c in left)])),
+            notes=(*self.notes, *notes),
         )
 
     @property
     def read(self) -> list[str]:
         """The needed columns, each once."""
-        wanted = [self.time, self.label, self.key, *self.channels]
-        return list(dict.fromkeys(name for name in wanted if name is not None))
+        wanted = [self.time, self.rest, self.label, self.key, *self.channels]
+        return list(dict.fromkeys(name for name in wanted if name))
+
+    def only(self, kept: Sequence[int], notes: Sequence[str]) -> Columns:
+        """The same with some of the channels, and notes on the others."""
+        gone = set(range(len(self.channels))) - set(kept)
+        return replace(
+            self,
+            channels=tuple(self.channels[i] for i in kept),
+            names=tuple(self.names[i] for i in kept),
+            units=tuple(self.units[i] for i in kept),
+            left_out=(*self.left_out, *(self.names[i] for i in sorted(gone))),
+            notes=(*self.notes, *notes),
+        )
+
+
+def stamp_columns(
+    path: Path, names: list[str], options: TableOptions, sample: Sample, what: str = "column"
+) -> Columns:
+    """A description of the stamp alone: one column, or two that hold it together.
+
+    Raises:
+        FileFormatError: there is no time, or the stamp stands in several columns.
+        InputError: an option names an unknown column.
+    """
+
+    def made(time: str, rest: str | None = None, unit: str = "", note: str = "") -> Columns:
+        notes = (note,) if note else ()
+        return Columns(time, None, (), (), (), rest=rest, rest_unit=unit, notes=notes)
+
+    def joined(time: str, rest: str, unit: str) -> Columns:
+        return made(time, rest, unit, f"the stamp is joined from columns {time!r} and {rest!r}")
+
+    pairs = [
+        pair for pair in split_stamps(names)
+        if is_rest(sample.numbers(pair[0]), sample.numbers(pair[1]), pair[2])
+    ]  # fmt: skip
+    if options.time_column is not None:
+        given = [_named(name, names, "time") for name in columns_in(options.time_column, names)]
+        if len(given) == 1:
+            return made(given[0])
+        if len(given) == 2:
+            unit = next((unit for one, two, unit in pairs if [one, two] == given), "")
+            if _is_date(sample, given[0]) and sample.is_text(given[1]):
+                return joined(given[0], given[1], "date")
+            for tried in (unit,) if unit else ("ns", "us", "ms"):
+                if is_rest(sample.numbers(given[0]), sample.numbers(given[1]), tried):
+                    return joined(given[0], given[1], tried)
+        raise InputError(
+            f"{path}: time_column must name one column, or two with whole seconds and the "
+            f"nanoseconds beside them, or with a date and a time of day, got {listed(given)}"
+        )
+    if options.rate_hz is not None:
+        return made("", note=f"stamps are row number / {options.rate_hz:g} Hz, as rate_hz says")
+    time = time_column_of(names)
+    if time is not None:
+        for one, two, unit in pairs:
+            if time in (one, two):
+                return joined(one, two, unit)
+        dates = [name for name in names if folded(name) in _DATES and _is_date(sample, name)]
+        if dates and sample.is_text(time) and not _is_date(sample, time):
+            return joined(dates[0], time, "date")
+        return made(time)
+    if len(pairs) == 1:
+        return joined(*pairs[0])
+    if pairs:
+        shown = ", ".join(f"[{one}, {two}]" for one, two, _ in pairs)
+        raise FileFormatError(
+            f"{path} has several stamps, each in two columns: {shown}; say which one is the time "
+            "with time_column="
+        )
+    raise FileFormatError(
+        f"{path} has no {what} of times: one must be called {', '.join(TIME_NAMES[:3])}, ... got "
+        f"{listed(names, 12)}; say which one with time_column=, or give rate_hz="
+    )
+
+
+_DATES = ("date", "day", "date_utc", "utc_date", "local_date")
+
+
+def _is_date(sample: Sample, name: str) -> bool:
+    text = _first(sample.texts(name))
+    return bool(text) and form_of(text) in ("with", "without")
+
+
+def _first(texts: Sequence[str]) -> str:
+    return next((text for text in texts if text), "")
+
+
+def columns_in(given: str | Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """The columns that an option names: one, or several as a list, `[a, b]` or `a,b`.
+
+    Raises:
+        InputError: they are not names.
+    """
+    if not isinstance(given, str):
+        parts = names_of("time_column", given) or ()
+        whole = ",".join(parts)
+        return (whole,) if whole in names and not set(parts) <= set(names) else parts
+    if given in names or not given.startswith("["):
+        parts = tuple(part.strip() for part in given.split(","))
+        return parts if given not in names and set(parts) <= set(names) else (given,)
+    return tuple(part.strip().strip("'\"") for part in given.strip("[]").split(","))
 
 
 def _named(name: str, columns: list[str], what: str) -> str:
@@ -146,15 +348,20 @@ def _named(name: str, columns: list[str], what: str) -> str:
 
 
 def _long_form(
-    rest: list[str], channel_column: str | None, value_column: str | None
+    rest: list[str], options: TableOptions, sample: Sample
 ) -> tuple[str | None, str | None]:
-    folded = {name.casefold(): name for name in reversed(rest)}
-    keys = [folded[name] for name in KEY_NAMES if name in folded]
-    values = [folded[name] for name in VALUE_NAMES if name in folded]
+    first_of: dict[str, str] = {}
+    for name in rest:
+        first_of.setdefault(name.casefold(), name)
+    keys = [first_of[name] for name in KEY_NAMES if name in first_of]
+    values = [first_of[name] for name in VALUE_NAMES if name in first_of]
+    channel_column, value_column = options.channel_column, options.value_column
     if channel_column is None and value_column is None:
-        if len(rest) == 2 and len(keys) == len(values) == 1:
-            return keys[0], values[0]
-        return None, None
+        if not (len(rest) == 2 and len(keys) == len(values) == 1):
+            return None, None
+        # A column of numbers with such a name is a channel.
+        is_key = sample.is_text(keys[0]) or not sample.numbers(keys[0]).size
+        return (keys[0], values[0]) if is_key else (None, None)
     key = (
         _named(channel_column, rest, "channel")
         if channel_column is not None
@@ -171,6 +378,37 @@ def _long_form(
     if value is None:
         value = one_of("value_column", "", left)
     return key, value
+
+
+def _instance_column(
+    stamp: Columns, rest: list[str], options: TableOptions, sample: Sample
+) -> str | None:
+    """The column with the sensor of each row, where rows of several sensors take turns.
+
+    By default a column of few texts that is named like a key, or of few integers that is named like
+    an instance and tells apart the rows of one stamp.
+    """
+    if options.instance_column is not None:
+        return _named(options.instance_column, rest, "instance")
+    if len(rest) < 2 or options.channels is not None:
+        return None
+    for name in rest:
+        usual = name.casefold()
+        if usual in KEY_NAMES and sample.is_text(name):
+            texts = sample.texts(name)
+            different = set(texts) - {""}
+            if 1 < len(different) <= min(_MOST_INSTANCES, len(texts) // 2) and "" not in texts:
+                return name
+        elif usual in INSTANCE_NAMES and not sample.is_text(name):
+            numbers = sample.numbers(name)
+            stamps = sample.texts(stamp.time) if stamp.time else []
+            if stamp.rest is not None:
+                stamps = list(map(str, zip(stamps, sample.texts(stamp.rest), strict=False)))
+            pairs = set(zip(stamps, numbers.tolist(), strict=False))
+            few = len(set(numbers.tolist())) <= _MOST_INSTANCES
+            if few and len(set(stamps)) < len(stamps) == len(pairs) == len(numbers):
+                return name
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +470,7 @@ def recordings(
     table: Gathered,
     *,
     shown: str = "",
+    found: bool = False,
 ) -> list[Recording]:
     """Makes one recording per label, or a single one, from the columns of a table.
 
@@ -242,17 +481,18 @@ def recordings(
         notes: of the recordings.
         table: the columns.
         shown: unit of the file, where the clock was converted already.
+        found: whether nothing states the unit of the clock.
 
     Raises:
         FileFormatError: a time is not finite, a selected channel is in no row, or two
             have one name.
     """
-    for i, name in enumerate(columns.names):
-        if name in columns.names[:i]:
-            raise FileFormatError(
-                f"{path} has two channels with the name {name!r}; rename one, or choose others "
-                "with channels="
-            )
+    if len(set(columns.names)) < len(columns.names):
+        name = next(n for n, count in Counter(columns.names).items() if count > 1)
+        raise FileFormatError(
+            f"{path} has two channels with the name {name!r}; rename one, or choose others "
+            "with channels="
+        )
     try:
         stamps, zero = to_nanoseconds(table.clock, unit)
     except FileFormatError as error:
@@ -267,7 +507,16 @@ def recordings(
             keys = Coded(table.keys.codes[rows], table.keys.texts)
             signals = _by_key(path, columns, keys, stamps[rows], values)
         made.append(
-            Recording(tuple(signals), text, origin, shown or unit, tuple(notes), clock_zero=zero)
+            Recording(
+                tuple(signals),
+                text,
+                origin,
+                shown or unit,
+                (*columns.notes, *notes),
+                clock_zero=zero,
+                unit_found=found,
+                left_out=columns.left_out,
+            )
         )
     return made
 
@@ -279,11 +528,42 @@ def _by_key(
     stamps: NDArray[np.int64],
     values: NDArray[np.float64],
 ) -> list[Signal]:
-    chosen = list(columns.chosen if columns.chosen is not None else keys.texts)
-    for name in [*chosen, *columns.stated]:
-        one_of("channel", name, keys.texts)
+    """A signal per key: a channel of the long form, or the channels of a sensor."""
     rows_of = dict(_groups(keys))
     nothing = np.zeros(0, dtype=np.int64)
+    if len(keys.texts) > MOST_CHANNELS:
+        raise FileFormatError(
+            f"{path} has {len(keys.texts)} different values in column {columns.key!r}, more than "
+            f"{MOST_CHANNELS} channels; choose another column with channel_column="
+        )
+    if columns.chosen is None and len(columns.channels) > 1:
+        numbered = all(text.lstrip("-").isdecimal() for text in keys.texts)
+        called = {
+            text: tuple(f"{n}[{text}]" if numbered else f"{text}.{n}" for n in columns.names)
+            for text in keys.texts
+        }
+        every = {name for names in called.values() for name in names}
+        for name in columns.stated:
+            if name not in every and name not in columns.names:
+                one_of("channel in units", name, every)
+        stated = columns.stated
+        return [
+            Signal(
+                "",
+                stamps[rows_of.get(text, nothing)],
+                values[rows_of.get(text, nothing)],
+                names,
+                tuple(
+                    stated.get(name, stated.get(short, unit))
+                    for name, short, unit in zip(names, columns.names, columns.units, strict=True)
+                ),
+            )
+            for text, names in called.items()
+        ]
+    chosen = list(columns.chosen if columns.chosen is not None else keys.texts)
+    for name in [*chosen, *columns.stated]:
+        if name not in rows_of and name not in keys.texts:
+            one_of("channel", name, keys.texts)
     return [
         Signal(
             "",
@@ -318,6 +598,7 @@ def _groups(coded: Coded | None) -> list[tuple[str, Any]]:
     return [(coded.texts[codes[rows[0]]], rows) for rows in groups]
 
 
-def listed(names: Sequence[str]) -> str:
-    """Names in quotes, for messages."""
-    return ", ".join(map(repr, names))
+def listed(names: Sequence[str], most: int = 20) -> str:
+    """Names in quotes, for messages; of many names, the first ones and the number of the rest."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(repr, names[:most])) + more

@@ -11,10 +11,13 @@ Only arrays of numbers are read; pickled data are refused.
 
 from __future__ import annotations
 
+import importlib
+import itertools
 import json
+import math
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import state_time_unit, time_column_of, to_nanoseconds
+from offbeat.data.cleaning.options import is_number
+from offbeat.data.memory import require_memory
 from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file, starts_with
-from offbeat.errors import FileFormatError, InputError, one_of, require
+from offbeat.errors import FileFormatError, InputError, OffbeatError, one_of, require
 
 SUFFIXES = (".hdf5", ".h5", ".hdf")
 
@@ -33,6 +38,9 @@ WIDEST = 1024
 """Arrays with at least this many numbers per row are treated as images or maps, and left out."""
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
+_DEEPEST = 30  # groups in groups
+_MOST_ARRAYS = 10_000
+_SMALL, _RATIO = 1 << 26, 2000  # bytes of an array that need no check; the most of compression
 _EPISODE = re.compile(r"(?:demo|episode)_(\d+)")
 _MAIN = ("data/main_data.hdf5", "main_data.hdf5")
 
@@ -51,6 +59,7 @@ def recordings(
     include_actions: bool = True,
     mask: str | None = None,
     rate_hz: float | None = None,
+    time_column: str | None = None,
     time_unit: str | None = None,
 ) -> Iterator[Recording]:
     """Reads HDF5 of robomimic or Minari: a recording per episode, in the order of their numbers.
@@ -63,7 +72,9 @@ def recordings(
         mask: robomimic's name of a subset of the episodes, such as `train`.
         rate_hz: rows per second. By default that of the environment, if the file has it; else
             rows are assumed to be 1 s apart, which is noted.
-        time_unit: unit of an observation that is the time, where there is one.
+        time_column: array of the times, among the observations or beside them, such as
+            `timestamps`; by default one that is named like a time, see `TIME_NAMES`.
+        time_unit: unit of those times; by default from their name, else detected.
 
     Yields:
         Recordings; an observation `<name>_quat` of four numbers is a quaternion.
@@ -76,8 +87,12 @@ def recordings(
     """
     require("h5py", "hdf5")
     keys = names("keys", keys)
-    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
-        raise InputError(f"rate_hz must be rows per second, above 0, got {rate_hz}")
+    if rate_hz is not None and not (is_number(rate_hz) and 0 < rate_hz <= 1e9):
+        raise InputError(f"rate_hz must be rows per second, above 0, got {rate_hz!r}")
+    if not isinstance(include_actions, bool):
+        raise InputError(f"include_actions must be True or False, got {include_actions!r}")
+    if time_column is not None and rate_hz is not None:
+        raise InputError("give time_column or rate_hz, not both")
     path = Path(path)
     if path.is_dir():
         inside = [path / name for name in _MAIN if (path / name).is_file()]
@@ -104,7 +119,8 @@ def recordings(
             observations = _observations(root[name], path, robomimic=robomimic)
             yield _episode(
                 root[name], observations, path, notes,
-                keys=keys, actions=include_actions, rate=rate, time_unit=time_unit,
+                keys=keys, actions=include_actions, rate=rate,
+                time_column=time_column, time_unit=time_unit, given_rate=rate_hz is not None,
             )  # fmt: skip
 
 
@@ -113,11 +129,15 @@ def _opened(path: Path) -> Iterator[Any]:
     """Opens the file; converts errors of HDF5 to one line."""
     import h5py
 
+    with suppress(ImportError):
+        importlib.import_module("hdf5plugin")  # registers filters, where it is installed
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, RuntimeError) as error:
-        what = " ".join(str(error).split())
+    except OffbeatError:
+        raise
+    except Exception as error:  # of h5py about damaged files: of any kind
+        what = " ".join(str(error).split())[:120]
         raise FileFormatError(
             f"{path} can't be read as HDF5, it is truncated, damaged or of another format "
             f"({what}); copy it again"
@@ -129,6 +149,7 @@ def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:
     if not masks:
         raise InputError(f"{path} has no masks, leave mask out")
     listed = file["mask"][one_of(f"mask of {path.name}", mask, masks)]
+    _check_storage(listed, path)
     if listed.dtype.kind not in "SO":
         raise FileFormatError(f"{path}: the mask {mask!r} holds {listed.dtype}, expected names")
     chosen = {text.decode() if isinstance(text, bytes) else str(text) for text in listed[()]}
@@ -157,9 +178,9 @@ def _rate(
 def _control_hz(root: Any) -> float | None:
     try:
         rate = json.loads(root.attrs["env_args"])["env_kwargs"]["control_freq"]
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, RecursionError, OSError):
         return None
-    return float(rate) if isinstance(rate, int | float) and rate > 0 else None
+    return float(rate) if is_number(rate) and 0 < rate <= 1e9 else None
 
 
 def _observations(episode: Any, path: Path, *, robomimic: bool) -> Any:
@@ -183,9 +204,12 @@ def _episode(
     keys: Sequence[str] | None,
     actions: bool,
     rate: float,
+    time_column: str | None,
     time_unit: str | None,
+    given_rate: bool,
 ) -> Recording:
-    leaves = dict(_leaves(observations, ""))
+    leaves = dict(itertools.islice(_leaves(observations, "", path), _MOST_ARRAYS))
+    times = {} if given_rate else _times(episode, leaves, path, time_column)
     if keys is not None:
         known = {name for leaf in leaves for name in _prefixes(leaf)}
         for key in keys:
@@ -193,19 +217,24 @@ def _episode(
     left: list[str] = []
     arrays: dict[str, NDArray[np.float64]] = {}
     clock: tuple[str, NDArray[Any]] | None = None
+    for name, dataset in times.items():
+        _check_storage(dataset, path)
+        clock = name, dataset[()].reshape(-1)
     for name, dataset in leaves.items():
         chosen = keys is not None and any(key in keys for key in _prefixes(name))
         if keys is not None and not chosen:
             continue
         _refuse_objects(dataset, path)
-        width = int(np.prod(dataset.shape[1:]))
+        width = math.prod(dataset.shape[1:]) if dataset.shape else 0
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
             left.append(f"{name} ({_what(dataset)})")
         elif not chosen and (width > WIDEST or dataset.ndim > 3):
             left.append(f"{name} ({' x '.join(map(str, dataset.shape[1:]))})")
-        elif width == 1 and time_column_of([name]):
-            clock = name, dataset[()].reshape(-1)
+        elif width == 1 and not chosen and time_column_of([name]):
+            if name not in times:
+                left.append(f"{name} (a time)")
         elif width:
+            _check_storage(dataset, path)
             arrays[name] = np.asarray(dataset[()], dtype=np.float64).reshape(len(dataset), width)
     if not arrays:
         raise FileFormatError(
@@ -219,10 +248,18 @@ def _episode(
             + ", ".join(f"{name} {n}" for name, n in rows.items())
         )
     n = next(iter(rows.values()))
+    label = episode.name.rpartition("/")[2]
+    if not n:
+        return Recording((), label, f"{path.name}, {label}",
+                         notes=(f"{label} has no rows and is left out",))  # fmt: skip
+    found = False
     if clock:
-        unit, more = state_time_unit(time_unit, clock[0], clock[1], str(path))
-        stamps, zero = to_nanoseconds(clock[1], unit)
-        notes = (f"stamps are the observation {clock[0]!r}", *more)
+        unit, more, found = state_time_unit(time_unit, clock[0], clock[1], str(path))
+        try:
+            stamps, zero = to_nanoseconds(clock[1], unit)
+        except FileFormatError as error:
+            raise FileFormatError(f"{path}: {clock[0]!r} of {label}: {error}") from None
+        notes = (f"stamps are the array {clock[0]!r}", *more)
     else:
         unit, zero = "s", 0
         stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
@@ -245,7 +282,6 @@ def _episode(
         kinds=(*kinds, *[""] * len(acted)),
         roles=("state",) * len(states) + ("action",) * len(acted),
     )
-    label = episode.name.rpartition("/")[2]
     return Recording(
         (signal,),
         label=label,
@@ -253,19 +289,107 @@ def _episode(
         time_unit=unit,
         notes=notes,
         clock_zero=zero,
+        unit_found=found,
+        left_out=tuple(name.partition(" ")[0] for name in left),
     )
 
 
-def _leaves(node: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """The arrays below a group, or the array itself, by path. Tuple elements are numbered."""
+def _times(
+    episode: Any, leaves: Mapping[str, Any], path: Path, given: str | None
+) -> dict[str, Any]:
+    """The array of times by its name: the one given, else one that is named like a time."""
+    import h5py
+
+    beside = {
+        name: array
+        for name in episode
+        if isinstance(array := _member(episode, name, path), h5py.Dataset)
+    }
+    known = {**beside, **leaves}
+    if given is not None:
+        if given not in known:
+            one_of("time_column", given, known)
+        name = given
+    else:
+        usual = [name for name, array in known.items() if array.shape[1:] in ((), (1,))]
+        name = time_column_of(usual) or ""
+    if not name:
+        return {}
+    array = known[name]
+    if (
+        array.dtype.kind not in "iuf"
+        or array.ndim not in (1, 2)
+        or array.shape[1:] not in ((), (1,))
+    ):
+        if given is None:
+            return {}
+        raise FileFormatError(
+            f"{path}: {array.name} has shape {array.shape} and type {array.dtype}, expected times"
+        )
+    return {name: array}
+
+
+def _leaves(node: Any, path: str, file: Path, depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """The arrays below a group, or the array itself, by path. Tuple elements are numbered.
+
+    Raises:
+        FileFormatError: groups are nested too deeply, or a link leaves the file.
+    """
     import h5py
 
     if isinstance(node, h5py.Dataset):
         yield path, node
         return
+    if depth > _DEEPEST:
+        raise FileFormatError(f"{file} nests groups more than {_DEEPEST} deep, at {node.name[:60]}")
     for name in node:
         here = name.removeprefix("_index_")
-        yield from _leaves(node[name], f"{path}/{here}" if path else here)
+        inner = _member(node, name, file)
+        yield from _leaves(inner, f"{path}/{here}" if path else here, file, depth + 1)
+
+
+def _member(group: Any, name: str, file: Path) -> Any:
+    """A member of a group, unless its link leads to another file."""
+    import h5py
+
+    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
+        raise FileFormatError(
+            f"{file}: {group.name}/{name} is a link to another file, expected data inside; copy "
+            "them into one file"
+        )
+    return group[name]
+
+
+def _check_storage(dataset: Any, path: Path) -> None:
+    """Checks that an array is stored in the file, in a form that can be read, and fits memory.
+
+    Raises:
+        FileFormatError: it is in another file, compressed with a filter that is not installed, or
+            far larger than what is stored.
+    """
+    import h5py
+
+    if dataset.external or dataset.is_virtual:
+        raise FileFormatError(
+            f"{path}: {dataset.name} is stored in another file, expected data inside; copy them "
+            "into one file"
+        )
+    created = dataset.id.get_create_plist()
+    for i in range(created.get_nfilters()):
+        code, _, _, name = created.get_filter(i)
+        if not h5py.h5z.filter_avail(code):
+            called = name.decode(errors="replace") or code
+            raise FileFormatError(
+                f"{path}: {dataset.name} is compressed with the filter {called!r}, which is not "
+                "installed; install it with: pip install hdf5plugin"
+            )
+    need = math.prod(dataset.shape) * max(dataset.dtype.itemsize, 8)
+    if need > _SMALL and need > _RATIO * path.stat().st_size:
+        raise FileFormatError(
+            f"{path}: {dataset.name} has shape {dataset.shape}, far more than the file of "
+            f"{path.stat().st_size} bytes holds; copy it again"
+        )
+    require_memory(path, need, f"an array of shape {dataset.shape} in {dataset.name}")
 
 
 def _prefixes(path: str) -> Iterator[str]:
@@ -316,12 +440,13 @@ def _actions(
         return [], [], ("there are no actions",)
     parts: list[NDArray[np.float64]] = []
     channels: list[str] = []
-    for name, dataset in _leaves(episode["actions"], ""):
+    for name, dataset in _leaves(_member(episode, "actions", path), "", path):
         _refuse_objects(dataset, path)
+        _check_storage(dataset, path)
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
             return [], [], (f"actions are left out, they hold {_what(dataset)}",)
         values = np.asarray(dataset[()], dtype=np.float64)
-        parts.append(values.reshape(len(values), -1))
+        parts.append(values.reshape(len(values), math.prod(values.shape[1:])))
         start = f"action.{name}" if name else "action"
         channels += [f"{start}[{i}]" for i in range(parts[-1].shape[1])]
     if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (rows, rows - 1):

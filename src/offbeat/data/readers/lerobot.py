@@ -23,15 +23,18 @@ from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import is_list
 from offbeat.data.readers.lerobot_info import WIDEST, Feature, Info, Rows, read_columns
 from offbeat.data.signals import Recording, Signal
-from offbeat.errors import FileFormatError, one_of
+from offbeat.errors import FileFormatError, InputError, one_of
 
 
 def root_of(path: Path) -> Path | None:
     """The folder of the data set that a path belongs to, or None."""
     path = path.absolute()
     for folder in (path, *path.parents[:4]):
-        if (folder / "meta" / "info.json").is_file():
-            return folder
+        try:
+            if (folder / "meta" / "info.json").is_file():
+                return folder
+        except (OSError, ValueError):
+            return None
     return None
 
 
@@ -89,9 +92,11 @@ def recordings(
         if not files:
             raise FileFormatError(f"{path} is not a file of any episode in {root / 'meta'}")
     if episodes is not None:
-        episodes = (episodes,) if isinstance(episodes, int) else episodes
+        episodes = (episodes,) if isinstance(episodes, int) else tuple(episodes)
         for number in episodes:
-            one_of("episode", str(number), map(str, files))
+            if number not in files or not isinstance(number, int):
+                one_of("episode", str(number), map(str, files))
+                raise InputError(f"episodes must be numbers, got {number!r}")
         files = {number: files[number] for number in sorted(set(episodes))}
     chosen, notes = info.chosen(columns)
     acted = [
@@ -152,7 +157,7 @@ class _Reading:
         episode = self.table.slice(int(rows[0]), int(rows[-1] - rows[0]) + 1)
         if episode.num_rows != len(rows):
             raise FileFormatError(f"{at.file}: the rows of episode {number} are not consecutive")
-        stamps, zero, unit, notes = self._stamps(episode, at.file)
+        stamps, zero, unit, notes, found = self._stamps(episode, at.file)
         alone = len(self.chosen) == 1
         features = [*self.chosen, *self.acted]
         named = [f.channels(alone=alone and f in self.chosen) for f in features]
@@ -170,29 +175,35 @@ class _Reading:
             time_unit=unit,
             notes=(*notes, *self.notes),
             clock_zero=zero,
+            unit_found=found,
+            left_out=tuple(self.info.features.keys() - {f.name for f in features}),
         )
 
     def _stamps(
         self, episode: Any, file: Path
-    ) -> tuple[NDArray[np.int64], int, str, tuple[str, ...]]:
-        """Nanoseconds, the clock at nanosecond 0, the column's unit, and notes."""
+    ) -> tuple[NDArray[np.int64], int, str, tuple[str, ...], bool]:
+        """Nanoseconds, the clock at nanosecond 0, the column's unit, notes, and if it was found."""
         fps = self.info.fps
         grid = np.rint(np.arange(episode.num_rows) * (1e9 / fps)).astype(np.int64)
         for name in self.clocks:
             clock = _raw(episode, name, file)
-            unit = "s"
+            unit, found = "s", False
             notes: tuple[str, ...] = ()
             if name != "timestamp" or self.time_unit is not None:
-                unit, notes = state_time_unit(
+                unit, notes, found = state_time_unit(
                     self.time_unit, name.rpartition(".")[2], clock, str(file)
                 )
-            stamps, zero = to_nanoseconds(clock, unit)
+            try:
+                stamps, zero = to_nanoseconds(clock, unit)
+            except FileFormatError as error:
+                raise FileFormatError(f"{file}, column {name!r}: {error}") from None
             # LeRobot's stamps are float32: differences of 1 us, or 1e-6 relative, are on the grid.
             near = 1_000 + grid // 1_000_000
             if self.given is None and (np.abs(stamps - stamps[:1] - grid) <= near).all():
                 continue
-            return stamps, zero, unit, (f"stamps are the column {name!r}", *notes)
-        return grid, 0, "s", (f"stamps are row number / {fps:g} fps, no times were recorded",)
+            return stamps, zero, unit, (f"stamps are the column {name!r}", *notes), found
+        note = f"stamps are row number / {fps:g} fps, no times were recorded"
+        return grid, 0, "s", (note,), False
 
 
 def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from offbeat.data.cleaning.clocks import time_column_of
+from offbeat.data.readers.columns import listed as quoted
 from offbeat.data.readers.options import names
-from offbeat.data.source import require_file
+from offbeat.data.source import inside, read_json, require_file
 from offbeat.errors import FileFormatError, one_of
 
 WIDEST = 1024
 """Features with at least this many numbers per row are treated as images and left out."""
 
 _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-_BESIDE = ("next.", "action", "annotation.", "complementary_info", "task", "subtask", "language")
+_BESIDE = ("next.", "annotation.", "complementary_info.")  # rewards, labels, and what is no state
+_LONGEST_AXIS = 1 << 20
 _NUMBERS = re.compile(r"(u?int|float|bool)\d*")
 
 
@@ -36,7 +37,7 @@ class Feature:
     @property
     def width(self) -> int:
         """Numbers per row."""
-        return int(np.prod(self.shape))
+        return math.prod(self.shape)
 
     @property
     def is_number(self) -> bool:
@@ -87,9 +88,9 @@ class Info:
     @classmethod
     def of(cls, root: Path) -> Info:
         """Reads and checks the metadata."""
-        path = require_file(root / "meta" / "info.json")
+        path = root / "meta" / "info.json"
+        found = read_json(path)
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
             features = {
                 name: Feature(
                     name,
@@ -102,19 +103,28 @@ class Info:
             version, fps = str(found["codebase_version"]), float(found["fps"])
             data_path = str(found["data_path"])
             total, chunk = int(found["total_episodes"]), int(found.get("chunks_size", 1000))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise FileFormatError(
-                f"{path} is not the info.json of a LeRobot data set ({error!r}); download it again"
+                f"{path} is not the info.json of a LeRobot data set ({str(error)[:100]!r}); "
+                "download it again"
             ) from None
         if not re.match(r"v[23]\.", version):
             raise FileFormatError(
                 f"{path} is of version {version}, expected v2.0, v2.1 or v3.0; convert it with "
                 "LeRobot"
             )
-        if not fps > 0 or not features:
+        if not 0 < fps < 1e9 or not features or chunk < 1 or total < 0:
             raise FileFormatError(
-                f"{path} says {fps:g} fps and {len(features)} features, expected some"
+                f"{path} says {fps:g} fps, {len(features)} features, {total} episodes and "
+                f"{chunk} in a folder, expected some of each"
             )
+        for feature in features.values():
+            if not all(0 <= n <= _LONGEST_AXIS for n in feature.shape):
+                raise FileFormatError(
+                    f"{path} says that {feature.name[:60]!r} has shape {feature.shape[:4]}, "
+                    f"expected sizes from 0 to {_LONGEST_AXIS}"
+                )
+        _check_pattern(data_path, path)
         return cls(root, version, fps, features, data_path, total, chunk)
 
     def chosen(self, columns: Sequence[str] | None) -> tuple[list[Feature], list[str]]:
@@ -126,9 +136,11 @@ class Info:
             return [self.features[name] for name in listed], []
         chosen, left = [], []
         for feature in self.features.values():
-            if feature.name in _BOOKKEEPING or feature.name.startswith(_BESIDE):
+            if feature.name in _BOOKKEEPING or feature.role == "action":
                 continue
-            if feature.is_number and feature.width <= WIDEST and len(feature.shape) < 3:
+            if feature.name.startswith(_BESIDE):
+                left.append(feature.name)
+            elif feature.is_number and 0 < feature.width <= WIDEST and len(feature.shape) < 3:
                 if not feature.is_time:
                     chosen.append(feature)
             else:
@@ -136,9 +148,9 @@ class Info:
         if not chosen:
             raise FileFormatError(
                 f"{self.root} has no features that are numbers but actions and bookkeeping; "
-                f"choose with columns= from: {', '.join(self.features)}"
+                f"choose with columns= from: {quoted(list(self.features), 12)}"
             )
-        return chosen, [f"left out: {', '.join(left)}"] if left else []
+        return chosen, [f"left out unless chosen with columns=: {', '.join(left)}"] if left else []
 
     def episode_files(self) -> dict[int, Rows]:
         """The file of each episode, by its number."""
@@ -153,8 +165,19 @@ class Info:
                     if line.strip():
                         found = json.loads(line)
                         lengths[int(found["episode_index"])] = int(found["length"])
-            except (KeyError, TypeError, ValueError) as error:
-                raise FileFormatError(f"{path} is damaged ({error!r}); download it again") from None
+            except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+                raise FileFormatError(
+                    f"{path} is damaged ({str(error)[:100]!r}); download it again"
+                ) from None
+            if any(number < 0 or length < 0 for number, length in lengths.items()):
+                raise FileFormatError(f"{path} holds a negative number; download it again")
+        else:
+            there = sum(1 for _ in self.root.glob("data/**/*.parquet"))
+            if self.total > there:
+                raise FileFormatError(
+                    f"{self.root / 'meta' / 'info.json'} says {self.total} episodes, and there are "
+                    f"{there} files of data; download the rest"
+                )
         return {
             number: Rows(
                 self._file(
@@ -181,17 +204,36 @@ class Info:
             for number, length, chunk, file in zip(
                 *(table.column(name).to_pylist() for name in columns), strict=True
             ):
-                found[int(number)] = Rows(self._file(chunk_index=chunk, file_index=file), length)
+                if not all(isinstance(n, int) and n >= 0 for n in (number, length, chunk, file)):
+                    raise FileFormatError(
+                        f"{path} has an episode {number!r} of {length!r} rows in chunk {chunk!r}, "
+                        f"file {file!r}, expected numbers from 0; download it again"
+                    )
+                found[number] = Rows(self._file(chunk_index=chunk, file_index=file), length)
         return dict(sorted(found.items()))
 
     def _file(self, **numbers: Any) -> Path:
+        where = self.root / "meta" / "info.json"
         try:
-            return self.root / self.data_path.format(**numbers)
+            name = self.data_path.format(**numbers)
         except (KeyError, ValueError, IndexError) as error:
             raise FileFormatError(
-                f"{self.root}: the pattern {self.data_path!r} in meta/info.json can't be filled "
-                f"({error!r})"
+                f"{where}: the pattern {self.data_path[:100]!r} can't be filled ({error!r})"
             ) from None
+        return inside(self.root, name, where)
+
+
+_FIELD = re.compile(r"\{[a-z_]+(:0?\d{0,2}d?)?\}")
+
+
+def _check_pattern(pattern: str, path: Path) -> None:
+    """Raises an error for a pattern of file names with anything but numbers to fill in."""
+    rest = _FIELD.sub("", pattern)
+    if "{" in rest or "}" in rest or len(pattern) > 1000:
+        raise FileFormatError(
+            f"{path} has the pattern {pattern[:100]!r} of file names, expected one such as "
+            "'data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet'"
+        )
 
 
 def _labels(feature: dict[str, Any]) -> tuple[str, ...]:
@@ -204,7 +246,7 @@ def _labels(feature: dict[str, Any]) -> tuple[str, ...]:
         names = names[0]
     if isinstance(names, list) and names and all(isinstance(part, list) for part in names):
         names = [name for part in names for name in part]
-    width = int(np.prod(feature.get("shape") or (1,)))
+    width = math.prod(int(n) for n in feature.get("shape") or (1,))
     if not isinstance(names, list) or len(names) != width or width == 1:
         return ()
     labels = [str(name) for name in names]
@@ -229,7 +271,9 @@ def read_columns(path: Path, columns: list[str]) -> Any:
                     f"has: {', '.join(file.schema_arrow.names)}"
                 )
             return file.read(columns=columns)
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+    except FileFormatError:
+        raise
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise FileFormatError(
             f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
             f"({' '.join(str(error).split())}); download it again"

@@ -3,31 +3,50 @@
 from __future__ import annotations
 
 import zipfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import state_time_unit, time_column_of
+from offbeat.data.cleaning.clocks import join_stamp, state_time_unit
 from offbeat.data.memory import require_memory
-from offbeat.data.readers.columns import LABEL_NAMES, Coder, Columns, Gathered, listed, recordings
+from offbeat.data.readers.columns import (
+    LABEL_NAMES,
+    Coded,
+    Coder,
+    Columns,
+    Gathered,
+    TableOptions,
+    recordings,
+    stamp_columns,
+)
+from offbeat.data.readers.stamps import date_and_time, form_of, over_midnight, stamps_of
 from offbeat.data.recording import Recording
+from offbeat.data.signals import MOST_CHANNELS
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, one_of
 
-_NAMES, _UNITS = ("names", "channels", "columns"), ("units",)
+_NAMES = ("names", "channels", "columns")
+_SPECIAL = (*_NAMES, "units")
+_SAMPLE = 1000
+_MOST_ARRAYS = 10_000
 
 
 def read_npz(
     path: str | Path,
     *,
-    time_column: str | None = None,
+    time_column: str | Sequence[str] | None = None,
     trajectory_column: str | None = None,
     channels: Sequence[str] | None = None,
+    without: Sequence[str] = (),
     time_unit: str | None = None,
     units: Mapping[str, str] | None = None,
+    instance_column: str | None = None,
+    rate_hz: float | None = None,
 ) -> list[Recording]:
     """Reads recordings from an NPZ file; nothing in it is unpickled.
 
@@ -39,13 +58,17 @@ def read_npz(
 
     Args:
         path: the file.
-        time_column: the array of times; by default found by its name, see `TIME_NAMES`.
+        time_column: the array of times, or two that hold the stamp together, as `[sec, nanosec]`;
+            by default found by its name, see `TIME_NAMES`.
         trajectory_column: the array, of shape (rows,), with the trajectory of each row;
             by default found by its name, see `LABEL_NAMES`.
         channels: the channels to read, in this order; by default all.
-        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default from the array's name or type,
-            else detected from the numbers, which is noted, else `s`.
+        without: arrays or channels to leave out.
+        time_unit: `s`, `ms`, `us`, `100ns`, `ns`, `min`, `h` or `d`; by default from the array's
+            name or type, else detected from the numbers, which is noted, else `s`.
         units: unit of a channel by its name.
+        instance_column: the array with the sensor of each row, as in CSV.
+        rate_hz: rows per second, for a file without times.
 
     Returns:
         A recording per trajectory.
@@ -58,80 +81,182 @@ def read_npz(
     path = require_file(path)
     _check_size(path)
     arrays = _load(path)
-    time = (
-        time_column_of(list(arrays))
-        if time_column is None
-        else one_of("time_column", time_column, arrays)
+    options = TableOptions(
+        time_column=time_column,
+        trajectory_column=trajectory_column,
+        channels=channels,
+        without=without,
+        units=units,
+        instance_column=instance_column,
+        rate_hz=rate_hz,
     )
-    if time is None:
+    stamp = stamp_columns(path, list(arrays), options, _NpzSample(arrays), "array")
+    shape = arrays[stamp.time].shape if stamp.time else _most_common_length(arrays)
+    if len(shape) not in (1, 2) or (stamp.time and arrays[stamp.time].dtype.kind not in "iufmMSU"):
+        array = arrays[stamp.time]
         raise FileFormatError(
-            f"{path} has no array of times: one must be called time, t, timestamp, ... got "
-            f"{listed(list(arrays))}; say which one with time_column="
+            f"{path} has times of shape {array.shape} and type {array.dtype} in {stamp.time!r}, "
+            "expected numbers of shape (rows,) or (episodes, rows)"
         )
-    clock = arrays.pop(time)
-    if clock.ndim not in (1, 2) or clock.dtype.kind not in "iufmM":
+    clock, unit, notes, found = _clock(path, arrays, stamp, shape, options, time_unit)
+    table, stated, left = _table(arrays, shape, {stamp.time, stamp.rest})
+    if not any(array.dtype.kind in "biuf" for array in table.values()):
+        shapes = ", ".join(f"{name!r} {array.shape}" for name, array in arrays.items()
+                           if name != stamp.time) or "nothing"  # fmt: skip
         raise FileFormatError(
-            f"{path} has times of shape {clock.shape} and type {clock.dtype} in {time!r}, expected "
-            "numbers of shape (rows,) or (episodes, rows)"
+            f"{path} has no array with a row for each of the {shape} times in {stamp.time!r}, "
+            f"besides them it has {shapes}"
         )
-    label = trajectory_column
-    if label is not None:
-        one_of("trajectory_column", label, arrays)
-    elif clock.ndim == 1:
-        label = next((name for name in arrays if name.casefold() in LABEL_NAMES), None)
-    labels = _labels(path, arrays.pop(label), label, clock) if label is not None else None
-    notes: tuple[str, ...] = ()
+    if left:
+        notes = (*notes, f"arrays without a row per time are left out: {', '.join(left[:20])}")
+    if len(table) > MOST_CHANNELS:
+        raise FileFormatError(f"{path} has {len(table)} columns, more than {MOST_CHANNELS}")
+    if len(shape) == 2:
+        clock, labels, table = _by_episode(clock, table)
+        table = {_EPISODE: labels, **table}
+        options = replace(options, trajectory_column=_EPISODE)
+    options = _with_labels(path, arrays, options, table, shape)
+    gone = {n for n in options.without for n in (n, *(f for f in table if f.startswith(f"{n}.")))}
+    table = {name: column for name, column in table.items() if name not in gone}
+    names = [*table]
+    for name in options.units or {}:
+        one_of("channel in units", name, names)
+    options = replace(
+        options, units={**{n: u for n, u in stated.items() if n in table}, **(options.units or {})},
+        time_column=None, rate_hz=1.0, without=(),
+    )  # fmt: skip
+    columns = Columns.of(path, names, options, _NpzSample(table))
+    columns = replace(
+        columns,
+        time=stamp.time,
+        notes=(*stamp.notes, *columns.notes[1:]),
+        left_out=(*columns.left_out, *left, *gone),
+    )
+    values = np.stack([table[name].astype(np.float64) for name in columns.channels])
+    gathered = Gathered(clock, _coded(table, columns.label), _coded(table, columns.key), values.T)
+    return recordings(path, columns, unit, notes, gathered, found=found)
+
+
+@dataclass(frozen=True)
+class _NpzSample:
+    """The first values of arrays."""
+
+    arrays: Mapping[str, NDArray[Any]]
+
+    def is_text(self, name: str) -> bool:
+        """Whether an array holds no numbers."""
+        return self.arrays[name].dtype.kind not in "biuf"
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        array = self.arrays[name]
+        if array.dtype.kind not in "biuf" or array.ndim != 1:
+            return np.zeros(0)
+        return array[:_SAMPLE].astype(np.float64)
+
+    def texts(self, name: str) -> list[str]:
+        array = self.arrays[name]
+        return [str(value) for value in array[:_SAMPLE].tolist()] if array.ndim == 1 else []
+
+
+def _most_common_length(arrays: Mapping[str, NDArray[Any]]) -> tuple[int, ...]:
+    """The length that most arrays of numbers have, the longer one of two as common."""
+    lengths = Counter(len(array) for array in arrays.values() if array.ndim in (1, 2))
+    return (max(lengths, key=lambda n: (lengths[n], n)),) if lengths else (0,)
+
+
+def _clock(
+    path: Path,
+    arrays: Mapping[str, NDArray[Any]],
+    stamp: Columns,
+    shape: tuple[int, ...],
+    options: TableOptions,
+    time_unit: str | None,
+) -> tuple[NDArray[Any], str, tuple[str, ...], bool]:
+    """The times, their unit, notes on it, and whether nothing states it."""
+    if not stamp.time:
+        rows = np.arange(shape[0])
+        return np.rint(rows * (1e9 / (options.rate_hz or 1.0))).astype(np.int64), "ns", (), False
+    clock = arrays[stamp.time]
+    if clock.dtype.kind in "SU":
+        clock = _of_texts(path, stamp, arrays)
+        return clock, "ns", (), False
+    if stamp.rest is not None and stamp.rest_unit != "date":
+        return join_stamp(clock, arrays[stamp.rest], stamp.rest_unit), "ns", (), False
     if clock.dtype.kind in "mM":
         unit = _unit_of_dates(path, clock)
         if np.isnat(clock).any():
             row = int(np.isnat(clock).argmax())
-            raise FileFormatError(f"{path} has no time in row {row} of {time!r}; drop that row")
-        clock = clock.astype(np.int64)
-    else:
-        unit, notes = state_time_unit(time_unit, time, np.ravel(clock)[:10_000], str(path))
-    names, stated, columns, left = _channels(arrays, clock.shape)
-    if not columns:
-        shapes = ", ".join(f"{name!r} {array.shape}" for name, array in arrays.items()) or "nothing"
+            raise FileFormatError(
+                f"{path} has no time in row {row} of {stamp.time!r}; drop that row"
+            )
+        return clock.astype(np.int64), unit, (), False
+    return clock, *state_time_unit(time_unit, stamp.time, np.ravel(clock)[:10_000], str(path))
+
+
+def _of_texts(path: Path, stamp: Columns, arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    import pyarrow as pa
+
+    texts = [pa.array([str(t) for t in arrays[n].astype(str).ravel().tolist()])
+             for n in (stamp.time, stamp.rest) if n]  # fmt: skip
+    first = texts[0][0].as_py() if len(texts[0]) else ""
+    form = form_of(first.strip())
+    try:
+        if form is None:
+            raise pa.ArrowInvalid(f"{first[:60]!r} is no time")
+        if stamp.rest is not None:
+            return np.asarray(date_and_time(texts[0], texts[1], form).cast(pa.int64()))
+        clock = np.asarray(stamps_of(texts[0], form).cast(pa.int64()))
+    except pa.ArrowException as error:
         raise FileFormatError(
-            f"{path} has no array with a row for each of the {clock.shape} times in {time!r}, "
-            f"besides them it has {shapes}"
-        )
-    if left:
-        notes = (*notes, f"arrays without a row per time are left out: {', '.join(left)}")
-    if channels is not None:
-        order = [names.index(one_of("channel", name, names)) for name in dict.fromkeys(channels)]
-        names, stated = [names[i] for i in order], [stated[i] for i in order]
-        columns = [columns[i] for i in order]
-    for name in units or {}:
-        one_of("channel in units", name, names)
-    given = dict(units or {})
-    values = np.stack([column.astype(np.float64) for column in columns])
-    if clock.ndim == 2:
-        clock, labels, values = _by_episode(clock, values)
-    described = Columns(
-        time,
-        label or ("episode" if labels else None),
-        tuple(names),
-        tuple(names),
-        tuple(given.get(name, unit) for name, unit in zip(names, stated, strict=True)),
+            f"{path} has times of text in {stamp.time!r}, expected numbers or ISO 8601 ({error})"
+        ) from None
+    return over_midnight(clock) if form == "of day" else clock
+
+
+_EPISODE = "episode"
+
+
+def _with_labels(
+    path: Path,
+    arrays: Mapping[str, NDArray[Any]],
+    options: TableOptions,
+    table: dict[str, NDArray[Any]],
+    shape: tuple[int, ...],
+) -> TableOptions:
+    """The options with the array of labels, which is checked."""
+    label = options.trajectory_column
+    if label is None:
+        label = next((name for name in arrays if name.casefold() in LABEL_NAMES), None)
+    if label is None or label in table:
+        return options
+    one_of("trajectory_column", label, arrays)
+    raise FileFormatError(
+        f"{path} has labels of shape {arrays[label].shape} in {label!r}, expected one per time, "
+        f"{shape}"
     )
-    coded = None
-    if labels is not None:
-        coder = Coder()
-        coder.add_texts(labels)
-        coded = coder.done()
-    return recordings(
-        path, described, unit, notes, Gathered(clock, coded, None, values.reshape(len(names), -1).T)
-    )
+
+
+def _coded(table: Mapping[str, NDArray[Any]], name: str | None) -> Coded | None:
+    if name is None:
+        return None
+    coder = Coder()
+    coder.add_texts([str(label) for label in table[name].tolist()])
+    return coder.done()
 
 
 def _check_size(path: Path) -> None:
     """Raises an error if the unpacked arrays and the values made from them do not fit."""
     try:
         with zipfile.ZipFile(path) as file:
-            size = sum(member.file_size for member in file.infolist())
-    except (zipfile.BadZipFile, OSError):
+            members = file.infolist()
+            size = sum(member.file_size for member in members)
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
         return  # reading it raises an error
+    if len(members) > _MOST_ARRAYS:
+        raise FileFormatError(
+            f"{path} holds {len(members)} arrays, more than {_MOST_ARRAYS}; save matrices with a "
+            "column per channel"
+        )
     require_memory(path, 2 * size, f"{size} bytes of arrays")
 
 
@@ -164,15 +289,6 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
         ) from None
 
 
-def _labels(path: Path, array: NDArray[Any], name: str | None, clock: NDArray[Any]) -> list[str]:
-    if array.shape != clock.shape or clock.ndim != 1:
-        raise FileFormatError(
-            f"{path} has labels of shape {array.shape} in {name!r}, expected one per time, "
-            f"{clock.shape}"
-        )
-    return [str(label) for label in array.tolist()]
-
-
 def _unit_of_dates(path: Path, clock: NDArray[Any]) -> str:
     unit, count = np.datetime_data(clock.dtype)
     if count != 1 or unit not in ("s", "ms", "us", "ns"):
@@ -180,51 +296,60 @@ def _unit_of_dates(path: Path, clock: NDArray[Any]) -> str:
     return unit
 
 
-def _channels(
-    arrays: dict[str, NDArray[Any]], shape: tuple[int, ...]
-) -> tuple[list[str], list[str], list[NDArray[Any]], list[str]]:
-    """Names, units and columns of the channels, and the names of the other arrays."""
+def _table(
+    arrays: Mapping[str, NDArray[Any]], shape: tuple[int, ...], stamp: set[str | None]
+) -> tuple[dict[str, NDArray[Any]], dict[str, str], list[str]]:
+    """A column per channel and label, units of channels, and the names of the other arrays."""
     axes = len(shape)
     fitting = {
         name: array
         for name, array in arrays.items()
-        if array.dtype.kind in "biuf" and array.shape[:axes] == shape and array.ndim <= axes + 1
+        if name not in stamp
+        and array.shape[:axes] == shape
+        and (
+            (array.dtype.kind in "biuf" and array.ndim <= axes + 1)
+            or (array.dtype.kind in "SU" and array.ndim == axes == 1 and name not in _SPECIAL)
+        )
     }
     matrices = [name for name, array in fitting.items() if array.ndim == axes + 1]
-    names: list[str] = []
-    units: list[str] = []
-    columns: list[NDArray[Any]] = []
+    table: dict[str, NDArray[Any]] = {}
+    stated: dict[str, str] = {}
     used: list[str] = []
     for name, array in fitting.items():
         if array.ndim == axes:
-            own, own_units = [name], [""]
-            columns.append(array)
+            own, columns = [name], [array]
         else:
             width = array.shape[-1]
-            own, own_units = [f"{name}.{i}" for i in range(width)], [""] * width
-            for texts, usual in ((own, _NAMES), (own_units, _UNITS)):
-                for key in usual:
-                    array_of_texts = arrays.get(key)
-                    if (
-                        array_of_texts is not None
-                        and len(matrices) == 1
-                        and array_of_texts.dtype.kind in "US"
-                        and array_of_texts.shape == (width,)
-                    ):
-                        texts[:] = [str(text) for text in array_of_texts.astype(str)]
-                        used.append(key)
-                        break
-            columns += [array[..., i] for i in range(width)]
-        names += own
-        units += own_units
-    left = [name for name in arrays if name not in fitting and name not in used]
-    return names, units, columns, left
+            own = [f"{name}.{i}" for i in range(width)]
+            columns = [array[..., i] for i in range(width)]
+            if len(matrices) == 1:
+                texts = {
+                    key: [str(text) for text in found.astype(str)]
+                    for key in _SPECIAL
+                    if (found := arrays.get(key)) is not None
+                    and found.dtype.kind in "US"
+                    and found.shape == (width,)
+                }
+                named = next((key for key in _NAMES if key in texts), None)
+                own = texts[named] if named else own
+                used += [named] if named else []
+                if "units" in texts:
+                    stated = dict(zip(own, texts["units"], strict=True))
+                    used.append("units")
+        for channel, column in zip(own, columns, strict=True):
+            if channel in table:
+                raise FileFormatError(
+                    f"there are two channels with the name {channel!r}; rename one"
+                )
+            table[channel] = column
+    left = [n for n in arrays if n not in fitting and n not in used and n not in stamp]
+    return table, stated, left
 
 
 def _by_episode(
-    clock: NDArray[Any], values: NDArray[np.float64]
-) -> tuple[NDArray[Any], list[str], NDArray[np.float64]]:
+    clock: NDArray[Any], table: dict[str, NDArray[Any]]
+) -> tuple[NDArray[Any], NDArray[Any], dict[str, NDArray[Any]]]:
     """Joins episodes, without the padding."""
     there = ~np.isnan(clock) if clock.dtype.kind == "f" else np.ones(clock.shape, dtype=bool)
     labels = np.repeat(np.arange(len(clock)), there.sum(axis=1))
-    return clock[there], [str(label) for label in labels.tolist()], values[:, there]
+    return clock[there], labels, {name: column[there] for name, column in table.items()}

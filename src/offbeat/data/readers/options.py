@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from offbeat.errors import InputError, one_of
 
@@ -15,7 +15,10 @@ def names(option: str, given: Iterable[str] | None) -> tuple[str, ...] | None:
     """
     if given is None:
         return None
-    listed = (given,) if isinstance(given, str) else tuple(given)
+    listed = (given,) if isinstance(given, str) else given
+    if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
+        raise InputError(f"{option} must be one name or more, got {given!r}")
+    listed = tuple(listed)
     if not listed or not all(isinstance(name, str) for name in listed):
         raise InputError(f"{option} must be one name or more, got {given!r}")
     return tuple(dict.fromkeys(listed))

@@ -5,15 +5,27 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from offbeat.data.cleaning.clocks import state_time_unit, time_column_of
 from offbeat.data.memory import require_rows
-from offbeat.data.readers.batches import NullValueError, gather_columns, is_list, line_error
-from offbeat.data.readers.columns import Columns, listed, recordings
+from offbeat.data.readers.batches import (
+    NullValueError,
+    clock_of_columns,
+    gather_columns,
+    is_list,
+    is_text,
+    line_error,
+)
+from offbeat.data.readers.columns import Columns, TableOptions, columns_in, recordings
+from offbeat.data.readers.stamps import EXAMPLE, form_of
 from offbeat.data.recording import Recording
+from offbeat.data.signals import MOST_CHANNELS
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError
 
@@ -22,91 +34,120 @@ _BUFFER = 1 << 18  # bytes of a column as it is stored, in memory at a time
 _THREADS = 4  # columns that are read at once, at most
 _MANY = 1 << 20  # minimum number of values per thread
 _INDEX = "__index_level_0__"  # name that pandas gives to an unnamed index
+_SAMPLE = 1000  # rows from which the meaning of a column is derived
 
 
 def read_parquet(
     path: str | Path,
     *,
-    time_column: str | None = None,
+    time_column: str | Sequence[str] | None = None,
     trajectory_column: str | None = None,
     channels: Sequence[str] | None = None,
+    without: Sequence[str] = (),
     time_unit: str | None = None,
     units: Mapping[str, str] | None = None,
     channel_column: str | None = None,
     value_column: str | None = None,
+    instance_column: str | None = None,
+    rate_hz: float | None = None,
 ) -> list[Recording]:
     """Reads recordings from Parquet: a row per time, or one per measured value.
 
-    Columns have the same meaning as in CSV. Columns of time stamps or durations have a unit. A
-    column of lists of one length gives a channel per element, `name.0`, `name.1`, ... The file is
-    read 65,536 rows at a time.
+    Columns have the same meaning as in CSV. Columns of time stamps, durations, dates or times of
+    day have a unit; times may be texts of ISO 8601, too. A column of lists of one length gives a
+    channel per element, `name.0`, `name.1`, ... Columns of anything else but numbers are left out,
+    which is noted. The file is read 65,536 rows at a time.
 
     Args:
         path: the file.
-        time_column: the column of times; by default found by its name, see `TIME_NAMES`, or the
-            index of pandas where it holds time stamps.
+        time_column: the column of times, or two that hold the stamp together; by default found by
+            its name, see `TIME_NAMES`, or the index of pandas where it holds time stamps.
         trajectory_column: the column with the trajectory of each row; by default found
             by its name, see `LABEL_NAMES`.
-        channels: the columns to read as channels, in this order; by default all.
-        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default from the column's type or name,
-            else detected from the numbers, which is noted, else `s`.
+        channels: the columns to read as channels, in this order; by default all numbers.
+        without: columns to leave out.
+        time_unit: `s`, `ms`, `us`, `100ns`, `ns`, `min`, `h` or `d`; by default from the column's
+            type or name, else detected from the numbers, which is noted, else `s`.
         units: unit of a channel by its name.
         channel_column: the column with the channel of each value, in the long form.
         value_column: the column of values, in the long form.
+        instance_column: the column with the sensor of each row, as in CSV.
+        rate_hz: rows per second, for a file without times.
 
     Returns:
         A recording per trajectory, in the order of their first rows; null is NaN.
 
     Raises:
-        FileFormatError: the file is missing, empty, truncated, not Parquet, has no time, or a
-            channel that is not numeric.
+        FileFormatError: the file is missing, empty, truncated, not Parquet, has no time, or no
+            channel that is numeric.
         InputError: an option names an unknown column or unit.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     path = require_file(path)
+    options = TableOptions(
+        time_column=time_column,
+        trajectory_column=trajectory_column,
+        channels=channels,
+        without=without,
+        units=units,
+        channel_column=channel_column,
+        value_column=value_column,
+        instance_column=instance_column,
+        rate_hz=rate_hz,
+    )
     try:
         with ExitStack() as opened:
             # Otherwise a whole row group, which can be the whole file, is in memory.
             bounded = {"pre_buffer": False, "buffer_size": _BUFFER}
             file = opened.enter_context(pq.ParquetFile(path, **bounded))
             schema = file.schema_arrow
-            columns = Columns.of(
-                path,
-                _names(schema, time_column),
-                time_column=time_column or _index_of_times(schema),
-                trajectory_column=trajectory_column,
-                channels=channels,
-                units=units,
-                channel_column=channel_column,
-                value_column=value_column,
-            )
+            if channels is None and len(schema.names) > MOST_CHANNELS:
+                raise FileFormatError(
+                    f"{path} has {len(schema.names)} columns, more than {MOST_CHANNELS}; choose "
+                    "some with channels="
+                )
+            if channels is None:
+                _check_names(path, schema, schema.names)
+            index = _index_of_times(schema)
+            if time_column is None and rate_hz is None and index is not None:
+                options = replace(options, time_column=index)
+            chunks = functools.partial(_chunks, file)
+            sample = _ParquetSample(schema, chunks)
+            columns = Columns.of(path, _names(schema, options.time_column), options, sample)
             _check_types(path, schema, columns)
             if not file.metadata.num_rows:
                 raise FileFormatError(f"{path} has columns and no rows, expected one per time")
             rows = file.metadata.num_rows
-            chunks = functools.partial(_chunks, file)
             widths = {
                 name: _width(path, name, chunks(name))
                 for name in columns.channels
                 if is_list(schema.field(name).type)
             }
             notes: tuple[str, ...] = ()
-            kind = schema.field(columns.time).type
-            if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-                unit = str(kind.unit)
+            found = False
+            kind = schema.field(columns.time).type if columns.time else None
+            form = _form(path, columns, sample) if columns.time and is_text(kind) else None
+            if not columns.time or columns.rest or is_text(kind) or _is_day(kind):
+                unit = "ns"
+            elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+                unit = str(schema.field(columns.time).type.unit)
             else:
-                sample = next(chunks(columns.time)).drop_null()
-                sample = sample.cast(pa.float64(), safe=False).to_numpy()
-                unit, notes = state_time_unit(time_unit, columns.time, sample, str(path))
+                numbers = next(chunks(columns.time)).drop_null()
+                numbers = numbers.cast(pa.float64(), safe=False).to_numpy()
+                unit, notes, found = state_time_unit(time_unit, columns.time, numbers, str(path))
             width = sum(widths.get(name, 1) for name in columns.channels)
             require_rows(path, rows, width)
+            if columns.time:
+                clock = clock_of_columns(chunks, columns, form)
+            else:
+                clock = np.rint(np.arange(rows) * (1e9 / (rate_hz or 1.0))).astype(np.int64)
             sources = [chunks]
             while len(sources) < min(_THREADS, pa.cpu_count(), rows * len(columns.read) // _MANY):
                 other = pq.ParquetFile(path, metadata=file.metadata, **bounded)
                 sources.append(functools.partial(_chunks, opened.enter_context(other)))
-            table = gather_columns(sources, columns, rows, widths=widths)
+            table = gather_columns(sources, columns, clock, widths=widths)
     except NullValueError as error:
         raise FileFormatError(
             f"{path} has an empty value in row {error.row}, column {error.column!r}, where every "
@@ -118,7 +159,61 @@ def read_parquet(
             f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
             f"({str(message).removeprefix(f'{path}: ')}); copy it again"
         ) from None
-    return recordings(path, _spread(columns, widths), unit, notes, table)
+    return recordings(path, _spread(columns, widths), unit, notes, table, found=found)
+
+
+@dataclass(frozen=True)
+class _ParquetSample:
+    """The first values of the columns."""
+
+    schema: Any
+    chunks: Any
+    first: dict[str, Any] = field(default_factory=dict)
+
+    def is_text(self, name: str) -> bool:
+        """Whether a column holds anything but numbers, booleans and lists of them."""
+        import pyarrow as pa
+
+        kind = self.schema.field(name).type
+        kind = kind.value_type if is_list(kind) else kind
+        if pa.types.is_dictionary(kind):
+            kind = kind.value_type
+        numbers = (
+            pa.types.is_integer,
+            pa.types.is_floating,
+            pa.types.is_boolean,
+            pa.types.is_decimal,
+            pa.types.is_null,
+        )
+        return not any(fits(kind) for fits in numbers)
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        import pyarrow as pa
+
+        if self.is_text(name) or is_list(self.schema.field(name).type):
+            return np.zeros(0)
+        numbers: NDArray[np.float64] = (
+            self._first(name).cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+        )
+        return numbers
+
+    def texts(self, name: str) -> list[str]:
+        import pyarrow as pa
+
+        kind = self.schema.field(name).type
+        if pa.types.is_nested(kind) or pa.types.is_binary(kind):
+            return []
+        return ["" if value is None else str(value) for value in self._first(name).to_pylist()]
+
+    def _first(self, name: str) -> Any:
+        if name not in self.first:
+            chunk = next((c for c in self.chunks(name) if len(c)), None)
+            if chunk is None:
+                import pyarrow as pa
+
+                chunk = pa.array([], self.schema.field(name).type)
+            self.first[name] = chunk.slice(0, _SAMPLE)
+        return self.first[name]
 
 
 def _chunks(file: Any, name: str) -> Iterator[Any]:
@@ -127,10 +222,10 @@ def _chunks(file: Any, name: str) -> Iterator[Any]:
         yield batch.column(name)
 
 
-def _names(schema: Any, time_column: str | None) -> list[str]:
+def _names(schema: Any, time_column: str | Sequence[str] | None) -> list[str]:
     """The columns, without the index of pandas unless it is the time."""
-    wanted = time_column or _index_of_times(schema)
-    return [name for name in schema.names if name != _INDEX or name == wanted]
+    wanted = columns_in(time_column, schema.names) if time_column is not None else ()
+    return [name for name in schema.names if name != _INDEX or name in wanted]
 
 
 def _index_of_times(schema: Any) -> str | None:
@@ -142,43 +237,58 @@ def _index_of_times(schema: Any) -> str | None:
     return _INDEX if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) else None
 
 
-def _check_types(path: Path, schema: Any, columns: Columns) -> None:
+def _is_day(kind: Any) -> bool:
     import pyarrow as pa
 
-    for name in columns.read:
+    return bool(pa.types.is_date(kind) or pa.types.is_time(kind))
+
+
+def _check_names(path: Path, schema: Any, names: Sequence[str]) -> None:
+    if len(set(schema.names)) == len(schema.names):
+        return
+    for name in names:
         if len(schema.get_all_field_indices(name)) > 1:
             raise FileFormatError(
                 f"{path} has the column {name!r} twice; give every column a name of its own, or "
                 "choose others with channels="
             )
+
+
+def _check_types(path: Path, schema: Any, columns: Columns) -> None:
+    import pyarrow as pa
+
+    _check_names(path, schema, columns.read)
     for label in (columns.label, columns.key):
         if label is not None and _is_no_label(schema.field(label).type):
             raise FileFormatError(
                 f"{path} has {schema.field(label).type} in column {label!r}, expected labels: "
                 "texts or numbers; name them with trajectory_column= and channel_column="
             )
+    if not columns.time:
+        return
     kind = schema.field(columns.time).type
     times = (pa.types.is_timestamp, pa.types.is_duration, pa.types.is_integer, pa.types.is_floating)
-    if not any(fits(kind) for fits in times):
+    if not any(fits(kind) for fits in (*times, _is_day, is_text)):
         raise FileFormatError(
             f"{path} has {kind} in column {columns.time!r}, expected times: numbers, time stamps "
             "or durations; say which column is the time with time_column="
         )
-    for name in columns.channels:
-        kind = schema.field(name).type
-        inner = kind.value_type if is_list(kind) else kind
-        numbers = (
-            pa.types.is_integer,
-            pa.types.is_floating,
-            pa.types.is_boolean,
-            pa.types.is_decimal,
-            pa.types.is_null,
+
+
+def _form(path: Path, columns: Columns, sample: _ParquetSample) -> str:
+    """The form of times as texts.
+
+    Raises:
+        FileFormatError: the first one is no time.
+    """
+    first = next((text for text in sample.texts(columns.time) if text), "")
+    form = form_of(first.strip())
+    if form is None:
+        raise FileFormatError(
+            f"{path} has {first[:60]!r} in column {columns.time!r}, expected times: numbers, time "
+            f"stamps, durations or texts such as {EXAMPLE}; name the column with time_column="
         )
-        if not any(fits(inner) for fits in numbers):
-            raise FileFormatError(
-                f"{path} has {kind} in column {name!r}, expected numbers; choose the columns that "
-                f"are channels with channels=, of: {listed(columns.channels)}"
-            )
+    return form
 
 
 def _is_no_label(kind: Any) -> bool:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from offbeat.data.cleaning.clocks import split_unit, time_unit_in
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.batches import NullValueError, gather
 from offbeat.data.readers.columns import Columns, recordings
@@ -18,6 +21,25 @@ from offbeat.errors import FileFormatError, InputError, one_of
 TUM_COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 """The eight numbers of a line of TUM: seconds, metres, and a scalar-last quaternion."""
 
+_POSE = {
+    **dict.fromkeys(("timestamp", "time", "t", "stamp", "ts", "timestamps"), "timestamp"),
+    **{
+        f"{start}{axis}": f"t{axis}"
+        for start in ("t", "p", "p_", "t_", "pos_", "")
+        for axis in "xyz"
+    },
+    **{f"position_{axis}": f"t{axis}" for axis in "xyz"},
+    **{f"{start}{a}": f"q{a}" for start in ("q", "q_", "quat_", "qu", "r") for a in "xyzw"},
+    **{f"orientation_{axis}": f"q{axis}" for axis in "xyzw"},
+    "i": "qx",
+    "j": "qy",
+    "k": "qz",
+    "w": "qw",
+}
+"""Words by which headers name the columns of a pose."""
+
+_LINES = 200  # lines from which the meaning of the numbers is derived
+_OFF_1 = 0.05  # from the length of a quaternion
 _COPIES = 3  # copies of a text in memory while it is read
 
 _TUM = Columns("timestamp", None, TUM_COLUMNS[1:], TUM_COLUMNS[1:], ("m",) * 3 + ("",) * 4)
@@ -27,7 +49,9 @@ def read_tum(path: str | Path) -> list[Recording]:
     """Reads a trajectory of poses in the format of the TUM RGB-D benchmark.
 
     Text without a header: per line `timestamp tx ty tz qx qy qz qw`, in seconds and metres, with
-    spaces between; lines that begin with # are comments. Stamps keep every digit to the nanosecond.
+    spaces between; lines that begin with # are comments. A comment that names eight columns in
+    another order, such as `qw` before `qx`, decides about the order. Stamps keep every digit to the
+    nanosecond. A last line that is cut off is left out, which is noted.
 
     Source: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 
@@ -51,11 +75,19 @@ def read_tum(path: str | Path) -> list[Recording]:
     text = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)[ \t]+$", b"", text))
     if not text:
         raise FileFormatError(f"{path} has no line of numbers, expected {' '.join(TUM_COLUMNS)}")
+    columns = _order(path)
+    notes: tuple[str, ...] = ()
+    whole, _, last = text.rpartition(b"\n")
+    if last and whole and len(last.split()) < len(TUM_COLUMNS):
+        text = whole + b"\n"
+        notes = ("the file ends in the middle of a line; it is read up to there",)
+    if columns != TUM_COLUMNS:
+        notes = (*notes, f"the header names the columns {' '.join(columns)}")
     for clock in (pa.decimal128(38, 9), pa.float64()):
         try:
             batches = pv.read_csv(
                 io.BytesIO(text),
-                read_options=pv.ReadOptions(column_names=TUM_COLUMNS),
+                read_options=pv.ReadOptions(column_names=columns),
                 parse_options=pv.ParseOptions(delimiter=" ", quote_char=False),
                 convert_options=pv.ConvertOptions(
                     column_types=dict.fromkeys(TUM_COLUMNS, pa.float64()) | {"timestamp": clock},
@@ -69,24 +101,85 @@ def read_tum(path: str | Path) -> list[Recording]:
     else:
         raise FileFormatError(f"{path} can't be read as TUM text; expected {' '.join(TUM_COLUMNS)}")
     unit = "ns" if clock != pa.float64() else "s"
-    made = recordings(path, _TUM, unit, (), table, shown="s")
+    made = recordings(path, _TUM, unit, notes, table, shown="s")
     kinds = ("",) * 3 + ("quaternion",) * 4
     return [replace(one, signals=(replace(one.signals[0], kinds=kinds),)) for one in made]
 
 
 def is_tum(path: Path) -> bool:
-    """Whether the first line of numbers of a text has eight of them, separated by spaces."""
+    """Whether a text holds lines of eight numbers, separated by spaces, that are poses.
+
+    They are if a comment above them names the columns of a pose, or if none names eight others and
+    the last four numbers have length 1 in most lines.
+    """
+    lines = _first_lines(path)
+    rows = [line.split() for line in lines if line.strip() and not _is_comment(line)]
+    if not rows or _numbers(" ".join(rows[0])) != len(TUM_COLUMNS):
+        return False
+    order = _order_in(lines)
+    if path.suffix.lower() == ".tum" or order is not None:
+        return order != ()
+    fours = [[float(x) for x in row[4:]] for row in rows if _numbers(" ".join(row)) == 8]
+    unit = sum(abs(math.hypot(*four) - 1) < _OFF_1 for four in fours)
+    return 4 * unit >= 3 * len(fours)
+
+
+def _order(path: Path) -> tuple[str, ...]:
+    """The columns of a file in its order.
+
+    Raises:
+        FileFormatError: a comment names eight columns that are no pose.
+    """
+    lines = _first_lines(path)
+    order = _order_in(lines)
+    if order == ():
+        named = next(line for line in reversed(lines) if _is_comment(line)).strip()
+        raise FileFormatError(
+            f"{path} names its columns {named[:100]!r}, expected {' '.join(TUM_COLUMNS)}; read it "
+            "with format=csv"
+        )
+    return TUM_COLUMNS if order is None else order
+
+
+def _order_in(lines: list[str]) -> tuple[str, ...] | None:
+    """The order of the columns that a comment above the numbers names.
+
+    None if no comment names eight columns; empty if they are not those of a pose.
+    """
+    above = list(itertools.takewhile(lambda line: not line.strip() or _is_comment(line), lines))
+    for line in reversed(above):
+        words = re.split(r"[\s,;]+", line.strip().lstrip("#% ").strip())
+        words = [split_unit(word)[0].casefold() for word in words if word]
+        words = [word for word in words if not word.startswith(("[", "("))]
+        if len(words) != len(TUM_COLUMNS):
+            continue
+        order = tuple(_POSE.get(word, "") for word in words)
+        known = sum(bool(name) for name in order)
+        if set(order) == set(TUM_COLUMNS) and order[0] == "timestamp":
+            return order
+        return () if known < len(order) else None
+    return None
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(("#", "%"))
+
+
+def _first_lines(path: Path) -> list[str]:
+    """The first lines of a text, up to a hundred of numbers; empty if it is no text."""
+    found: list[str] = []
     try:
+        if not path.is_file():
+            return []
         with path.open(encoding="utf-8-sig") as file:
-            for _ in range(1000):
+            for _ in range(_LINES):
                 line = file.readline(2000)
                 if not line:
-                    return False
-                if line.strip() and not line.lstrip().startswith("#"):
-                    return _numbers(line) == len(TUM_COLUMNS)
+                    break
+                found.append(line)
     except (OSError, UnicodeDecodeError):
-        return False
-    return False
+        return []
+    return found
 
 
 def read_euroc(path: str | Path, *, sensors: Sequence[str] | None = None) -> list[Recording]:
@@ -111,13 +204,16 @@ def read_euroc(path: str | Path, *, sensors: Sequence[str] | None = None) -> lis
     if not path.is_dir():
         if sensors is not None:
             raise InputError(f"{path} is the file of one sensor; leave sensors out")
-        [recording] = read_csv(path, time_unit="ns")
+        recording, *others = read_csv(path, time_unit="ns")
+        if others:
+            raise FileFormatError(f"{path} has a column of trajectories; read it with format=csv")
         signal = recording.signals[0]
         return [replace(recording, signals=(replace(signal, kinds=_kinds(signal.channels)),))]
     files = {file.parent.name: file for file in _data_files(path)}
     chosen = list(files) if sensors is None else [one_of("sensor", s, files) for s in sensors]
     signals: list[Signal] = []
     left: list[str] = []
+    notes: list[str] = []
     for sensor in chosen:
         require_file(files[sensor])
         if sensors is None and not _holds_numbers(files[sensor]):
@@ -125,21 +221,25 @@ def read_euroc(path: str | Path, *, sensors: Sequence[str] | None = None) -> lis
             continue
         [recording] = read_euroc(files[sensor])
         signals.append(replace(recording.signals[0], name=sensor))
+        notes += [f"{sensor}: {note}" for note in recording.notes]
     if not signals:
         raise FileFormatError(f"{path} has no sensor whose data.csv holds numbers, got {left}")
-    notes = (f"sensors without numbers are left out: {', '.join(left)}",) if left else ()
-    return [Recording(tuple(signals), origin=path.name, time_unit="ns", notes=notes)]
+    if left:
+        notes.append(f"sensors without numbers are left out: {', '.join(left)}")
+    return [Recording(tuple(signals), origin=path.name, time_unit="ns", notes=tuple(notes))]
 
 
 def is_euroc(path: Path) -> bool:
-    """Whether a folder holds sensors of EuRoC, or a CSV has its header."""
+    """Whether a folder holds sensors of EuRoC, or a CSV has its header and nanoseconds below it."""
     if path.is_dir():
         return any(is_euroc(file) for file in _data_files(path))
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            return file.readline(2000).startswith(("#timestamp", "# timestamp"))
-    except (OSError, UnicodeDecodeError):
+    first = next(iter(_first_lines(path)), "")
+    if not first.startswith(("#timestamp", "# timestamp")):
         return False
+    if time_unit_in(first.partition(",")[0]) is not None:
+        return time_unit_in(first.partition(",")[0]) == "ns"
+    rows = [line.partition(",")[0].strip() for line in _first_lines(path)[1:] if line.strip()]
+    return all(row.isdecimal() for row in rows if not row.startswith("#"))
 
 
 def _data_files(folder: Path) -> list[Path]:
@@ -148,9 +248,7 @@ def _data_files(folder: Path) -> list[Path]:
 
 def _holds_numbers(path: Path) -> bool:
     """Whether the first row of a CSV has only numbers."""
-    with path.open(encoding="utf-8-sig") as file:
-        file.readline()
-        row = file.readline(100_000)
+    row = next(iter(_first_lines(path)[1:2]), "").strip()
     return not row or _numbers(row.replace(",", " ")) == len(row.split(","))
 
 
@@ -171,7 +269,7 @@ def _explain(path: Path) -> None:
     """Raises an error that names the invalid line, if there is one."""
     try:
         with path.open(encoding="utf-8-sig") as file:
-            for number, line in enumerate(file, 1):
+            for number, line in enumerate(iter(lambda: file.readline(10_000), ""), 1):
                 text = line.strip()
                 if text and not text.startswith("#") and _numbers(text) != len(TUM_COLUMNS):
                     raise FileFormatError(

@@ -2,74 +2,101 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import re
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from offbeat.data.cleaning.clocks import NANOSECONDS_PER, state_time_unit
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.data.cleaning.clocks import NANOSECONDS_PER, state_time_unit, time_column_of
 from offbeat.data.memory import require_rows
-from offbeat.data.readers.batches import NullValueError, gather, line_error
-from offbeat.data.readers.columns import Columns, Gathered, listed, recordings
-from offbeat.data.readers.stamps import expected_after, form_of, with_stamps
+from offbeat.data.readers.batches import NullValueError, gather, line_error, with_joined
+from offbeat.data.readers.columns import Columns, Gathered, TableOptions, listed, recordings
+from offbeat.data.readers.csv_fields import BOOLEANS, MISSING, Converter, number_in
+from offbeat.data.readers.csv_layout import CsvLayout, find_csv_layout, is_comment
+from offbeat.data.readers.options import names as names_of
+from offbeat.data.readers.stamps import (
+    date_and_time,
+    expected_after,
+    form_of,
+    over_midnight,
+    with_stamps,
+)
+from offbeat.data.readers.text import DAMAGE, TextFile, no_text
 from offbeat.data.recording import Recording
+from offbeat.data.signals import MOST_CHANNELS
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, InputError, one_of
 
-MISSING = ("", "NaN", "nan", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None")
-"""Fields whose value is not known."""
-
-DELIMITERS = (",", ";", "\t")
-"""Tried in this order on the header, where none is given."""
-
-_BLANK = tuple(" " * n for n in range(1, 33))  # fields of padding only
-_BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
 _COMMA = re.compile(r"[+-]?\d+,\d+")
-_SAMPLE = 1000  # lines from which the type of a column is derived
+_GROUPED = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+_SAMPLE = 1000  # lines from which the meaning of a column is derived
 _BLOCK = 1 << 20  # bytes of text in memory at a time
 
 
 def read_csv(
     path: str | Path,
     *,
-    time_column: str | None = None,
+    time_column: str | Sequence[str] | None = None,
     trajectory_column: str | None = None,
     channels: Sequence[str] | None = None,
+    without: Sequence[str] = (),
     time_unit: str | None = None,
     units: Mapping[str, str] | None = None,
     delimiter: str | None = None,
     channel_column: str | None = None,
     value_column: str | None = None,
-    decimal: str = ".",
+    instance_column: str | None = None,
+    decimal: str | None = None,
+    missing: Sequence[str | float] = (),
+    column_names: Sequence[str] | None = None,
+    rate_hz: float | None = None,
 ) -> list[Recording]:
     """Reads recordings from CSV: a header, then one row per time, or one per measured value.
 
-    A first column without a name that counts the rows, as pandas writes it, is left out. A unit in
-    brackets after a name, as in `speed [m/s]`, is the channel's unit and no part of its name.
-    Times keep every digit down to the nanosecond, as numbers and as texts of ISO 8601, whose clock
-    counts nanoseconds since 1970 (in UTC if they have an offset). The file is read a mebibyte
-    at a time.
+    The text is UTF-8, UTF-16 with a byte order mark, or else Windows-1252, which is noted; it may
+    be compressed by gzip, bzip2 or xz. Lines above the header, comments (`#`, `%`, `//`), `sep=;`
+    and a line of units are found. A first column without a name that counts the rows, as pandas
+    writes it, is left out; one that holds times is the time. Columns of text are left out, which
+    is noted. A unit in brackets after a name, as in `speed [m/s]`, is the channel's unit and no
+    part of its name. Times keep every digit down to the nanosecond, as numbers and as texts
+    of ISO 8601, whose clock counts nanoseconds since 1970 (in UTC if they have an offset); times of
+    day count from midnight. A file that ends in the middle of a row is read up to there. The
+    file is read a mebibyte at a time.
 
     Args:
-        path: the file, in UTF-8.
-        time_column: the column of times; by default found by its name, see `TIME_NAMES`.
+        path: the file.
+        time_column: the column of times, or two that hold the stamp together, as `[sec, nanosec]`
+            and `[Date, Time]`; by default found by their names, see `TIME_NAMES`.
         trajectory_column: the column with the trajectory of each row, as a number or
             any text; by default found by its name, see `LABEL_NAMES`. Without one, the file is one
             trajectory.
         channels: the columns to read as channels (in the long form: their names in the column of
-            channels), in this order; by default all.
-        time_unit: `s`, `ms`, `us`, `100ns` or `ns`; by default from the column's name, else
-            detected from the numbers, which is noted, else `s`. Times of ISO 8601 need none.
+            channels), in this order; by default all numbers.
+        without: columns to leave out.
+        time_unit: `s`, `ms`, `us`, `100ns`, `ns`, `min`, `h` or `d`; by default from the column's
+            name, else detected from the numbers, which is noted, else `s`. Times of ISO 8601 need
+            none.
         units: unit of a channel by its name.
-        delimiter: the character between two fields; by default a comma, or the semicolon or tab
-            that the header has instead.
+        delimiter: the character between two fields, a blank for any number of them; by default
+            the comma, semicolon, tab, bar or blank that the header has.
         channel_column: the column with the channel of each value, in the long form; by
-            default used if the table has only a time, a `channel` and a `value`.
+            default used if the table has only a time, a `channel` of texts and a `value`.
         value_column: the column of values, in the long form.
-        decimal: the decimal separator of numbers, `.` or `,`.
+        instance_column: the column with the sensor of each row, where rows of several sensors take
+            turns; each sensor has channels of its own. By default one that is named like
+            `instance` or `sensor` and tells the rows apart.
+        decimal: the decimal separator of numbers, `.` or `,`; by default the comma where fields are
+            separated by something else and their numbers have commas and no points.
+        missing: more fields whose value is not known, such as `-999` or `lost`.
+        column_names: names of the columns of a file without a header.
+        rate_hz: rows per second, for a file without times.
 
     Returns:
         A recording per trajectory, in the order of their first rows; a field that is empty, or
@@ -78,181 +105,426 @@ def read_csv(
     Raises:
         FileFormatError: the file is missing or empty, its header or a row is invalid, or
             a field is not a number.
-        InputError: an option names an unknown column or unit.
+        InputError: an option names an unknown column or unit, or has a wrong type.
     """
-    if delimiter is not None and (
-        len(delimiter) != 1 or not delimiter.isascii() or delimiter in '"\r\n'
+    if delimiter is not None and not (
+        isinstance(delimiter, str)
+        and len(delimiter) == 1
+        and delimiter.isascii()
+        and delimiter not in '"\r\n'
     ):
         raise InputError(
             f"delimiter must be one ASCII character, no quote or line end, got {delimiter!r}"
         )
-    one_of("decimal", decimal, (".", ","))
-    file = _CsvFile(require_file(path), delimiter or ",", decimal)
-    if delimiter is None:
-        file = file.with_delimiter_of_header()
-    header = file.header()
-    sample = file.sample(header)
-    columns = Columns.of(
-        file.path,
-        [name for name in header if name],
+    if decimal is not None:
+        one_of("decimal", decimal, (".", ","))
+    column_names = names_of("column_names", column_names)
+    options = TableOptions(
         time_column=time_column,
         trajectory_column=trajectory_column,
         channels=channels,
+        without=without,
         units=units,
         channel_column=channel_column,
         value_column=value_column,
+        instance_column=instance_column,
+        rate_hz=rate_hz,
     )
-    unit = "ns"
-    notes: tuple[str, ...] = ()
-    if form_of(_first_time(sample, columns)) is None:
-        found = [file.number(field) for field in sample[columns.time]]
-        numbers = [number for number in found if number is not None]
-        unit, notes = state_time_unit(time_unit, columns.time, numbers, str(file.path))
-    if not header[0]:
-        notes = (*notes, "the first column has no name and counts the rows; it is left out")
-    if not header[-1]:
-        notes = (
-            *notes,
-            "the last column has no name and no field in the first lines; it is left out",
+    text = TextFile.of(require_file(path))
+    layout = find_csv_layout(text, delimiter, column_names)
+    file = _CsvFile(text, layout, decimal, (*MISSING, *map(str, missing)))
+    header, noted = file.header()
+    notes = [*noted]
+    sample = file.sample(header)
+    if decimal is None:
+        decimal, more = file.decimal_of(sample)
+        file = _CsvFile(text, layout, decimal, file.missing)
+        sample = _CsvSample(sample.fields, file)
+        notes += more
+    named = [name for name in header if name]
+    columns = Columns.of(text.path, named, options, sample)
+    if len(columns.channels) > MOST_CHANNELS:
+        raise FileFormatError(
+            f"{text.path} has {len(columns.channels)} columns of channels, more than "
+            f"{MOST_CHANNELS}; choose some with channels="
         )
-    table, counted_in = file.columns(header, sample, columns, unit)
-    return recordings(file.path, columns, counted_in, notes, table, shown=unit)
+    if columns.rest or not columns.time or sample.form_of(columns.time):
+        unit, found = "ns", False
+    else:
+        stated = state_time_unit(
+            time_unit, columns.time, sample.numbers(columns.time), str(text.path)
+        )
+        unit, found = stated.unit, stated.found
+        notes += stated.notes
+    columns, table, counted_in = file.columns(header, sample, columns, unit, rate_hz)
+    notes += [*text.notes, *file.notes]
+    if text.cuts:
+        notes.append(f"the compressed data end early ({text.cuts[0]}); they are read up to there")
+    return recordings(text.path, columns, counted_in, notes, table, shown=unit, found=found)
+
+
+@dataclass(frozen=True)
+class _CsvSample:
+    """The fields of the first lines, by column."""
+
+    fields: Mapping[str, list[str]]
+    file: _CsvFile
+
+    def texts(self, name: str) -> list[str]:
+        return ["" if f in self.file.missing else f for f in self.fields.get(name, [])]
+
+    def is_text(self, name: str) -> bool:
+        """Whether most of its known fields are neither numbers nor booleans."""
+        known = [f for f in self.fields[name] if f and f not in self.file.missing]
+        others = sum(f not in BOOLEANS and self.file.number(f) is None for f in known)
+        return 2 * others > len(known)
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        found = [self.file.number(f) for f in self.fields[name] if f not in self.file.missing]
+        if any(number is None for number in found):
+            return np.zeros(0)
+        return np.array(found, dtype=np.float64)
+
+    def form_of(self, name: str) -> str | None:
+        """The form of times as text, by the first one."""
+        return form_of(next((f for f in self.texts(name) if f), ""))
 
 
 @dataclass(frozen=True)
 class _CsvFile:
     """A CSV file, read by pyarrow, and line by line to locate errors."""
 
-    path: Path
-    delimiter: str
-    decimal: str
+    text: TextFile
+    layout: CsvLayout
+    decimal: str | None
+    missing: tuple[str, ...]
+    notes: list[str] = field(default_factory=list)
+    odd: list[str] = field(default_factory=list)  # rows with another number of fields
 
-    def with_delimiter_of_header(self) -> _CsvFile:
-        """The same file, with the delimiter of its header."""
-        _, fields = next(self._lines(), (0, [""]))
-        if len(fields) == 1:
-            for delimiter in DELIMITERS[1:]:
-                if delimiter in fields[0]:
-                    return replace(self, delimiter=delimiter)
-        return self
+    @property
+    def path(self) -> Path:
+        return self.text.path
 
-    def header(self) -> list[str]:
-        """The column names, stripped; unique; empty where one counts rows or ends all lines."""
-        line, fields = next(self._lines(), (0, []))
-        names = [field.strip() for field in fields]
-        if line != 1:
-            got = f"a header that ends in line {line}" if line else "empty lines alone"
-            raise FileFormatError(
-                f"{self.path} must name its columns in line 1, got {got}; correct its first line"
-            )
-        names[0] = names[0].removeprefix("#").strip()
-        if names[0] == "Unnamed: 0":
+    def header(self) -> tuple[list[str], list[str]]:
+        """The column names, unique, empty where a column is left out; and notes."""
+        names = list(self.layout.names)
+        notes = list(self.layout.notes)
+        if not names[0] or names[0] == "Unnamed: 0":
+            first = [fields[0].strip() for _, fields in itertools.islice(self._rows(), _SAMPLE)]
             names[0] = ""
-        for i, name in enumerate(names):
-            unnamed = (i == 0 and self._counts_rows()) or (
-                i == len(names) - 1 and self._is_empty(i)
+            if _counts(first):
+                notes.append("the first column has no name and counts the rows; it is left out")
+            elif first and not time_column_of(names[1:]) and all(map(_is_time, first)):
+                names[0] = "time"
+                notes.append("the first column has no name; it is taken for the time")
+            else:
+                self._refuse(names, "no name for column 0")
+        if not names[-1] and len(names) > 1:
+            if any(f.strip() for _, fields in self._first() for f in fields[len(names) - 1 :]):
+                self._refuse(names, f"no name for column {len(names) - 1}")
+            notes.append(
+                "the last column has no name and no field in the first lines; it is left out"
             )
-            if (name in names[:i] and name) or not (name or unnamed):
-                problem = f"the column name {name!r} twice" if name else f"no name for column {i}"
-                raise FileFormatError(
-                    f"{self.path} has {problem} in its first line, got {listed(names)}; "
-                    "give every column a name of its own"
-                )
-        return names
+        met: set[str] = set()
+        for i, name in enumerate(names):
+            if not name and 0 < i < len(names) - 1:
+                self._refuse(names, f"no name for column {i}")
+            if name in met and name:
+                self._refuse(names, f"the column name {name!r} twice")
+            met.add(name)
+        return names, notes
 
-    def _counts_rows(self) -> bool:
-        fields = [line[0] for _, line in itertools.islice(self._lines(), 1, _SAMPLE)]
-        first = int(fields[0]) if fields and fields[0].isdecimal() else 0
-        return fields == [str(first + i) for i in range(len(fields))]
+    def _refuse(self, names: list[str], problem: str) -> None:
+        raise FileFormatError(
+            f"{self.path} has {problem} in its header, got {listed(names)}; "
+            "give every column a name of its own"
+        )
 
-    def _is_empty(self, place: int) -> bool:
-        """Whether a column is empty in the first lines."""
-        lines = itertools.islice(self._lines(), 1, _SAMPLE)
-        return not any(field.strip() for _, fields in lines for field in fields[place:])
+    def _first(self) -> Iterator[tuple[int, list[str]]]:
+        return itertools.islice(self._rows(), _SAMPLE)
 
-    def sample(self, header: list[str]) -> dict[str, list[str]]:
-        """The fields of the first lines, by column."""
-        lines = [fields for _, fields in itertools.islice(self._lines(), 1, _SAMPLE)]
-        whole = [fields for fields in lines if len(fields) == len(header)]
-        return {name: [fields[i].strip() for fields in whole] for i, name in enumerate(header)}
+    def sample(self, header: list[str]) -> _CsvSample:
+        """The fields of the first lines."""
+        whole = [fields for _, fields in self._first() if len(fields) == len(header)]
+        columns = zip(*whole, strict=True) if whole else [()] * len(header)
+        return _CsvSample(
+            {n: [f.strip() for f in c] for n, c in zip(header, columns, strict=True)}, self
+        )
+
+    def decimal_of(self, sample: _CsvSample) -> tuple[str, list[str]]:
+        """The decimal separator of the first lines, and a note where it is the comma."""
+        if self.layout.delimiter == ",":
+            return ".", []
+        fields = [f for column in sample.fields.values() for f in column]
+        commas = any(_COMMA.fullmatch(f) for f in fields)
+        points = any("." in f and number_in(f, ".") is not None for f in fields)
+        if not commas or points:
+            return ".", []
+        if all(_GROUPED.fullmatch(f) for f in fields if _COMMA.fullmatch(f)):
+            first = next(f for f in fields if _COMMA.fullmatch(f))
+            raise InputError(
+                f"{self.path} has numbers such as {first!r}, whose comma may be a decimal point or "
+                "separate thousands; say which with decimal=',' or decimal='.'"
+            )
+        return ",", ["commas in numbers are taken for decimal points (decimal='.' says otherwise)"]
 
     def columns(
-        self, header: list[str], sample: dict[str, list[str]], columns: Columns, unit: str
-    ) -> tuple[Gathered, str]:
-        """The needed columns, and the unit of the clock."""
+        self,
+        header: list[str],
+        sample: _CsvSample,
+        columns: Columns,
+        unit: str,
+        rate_hz: float | None,
+    ) -> tuple[Columns, Gathered, str]:
+        """The columns with numbers, their values, and the unit of the clock."""
         import pyarrow as pa
 
-        types = {name: _type_of(sample[name]) for name in columns.channels}
-        types |= {name: pa.string() for name in (columns.label, columns.key) if name}
-        places = len(str(NANOSECONDS_PER[unit])) - 1
-        clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
-        if not all(
-            field.isascii() and field.lstrip("+-").isdecimal() for field in sample[columns.time]
-        ):
-            clocks = clocks[1:]
-        form = form_of(_first_time(sample, columns))
-        if form is not None:
-            clocks = [pa.string()]
         lines = self._count_lines()
-        if lines < 2:
+        if not lines:
             raise FileFormatError(f"{self.path} has a header and no rows, expected one per time")
-        require_rows(self.path, lines - 1, len(columns.channels))
-        for clock in clocks:
-            batches = self._batches(header, columns, types | {columns.time: clock})
-            if form is not None:
-                batches = with_stamps(batches, columns.time, form, MISSING)
+        require_rows(self.path, lines, len(columns.channels))
+        clocks = self._clock_types(sample, columns, unit)
+        form = sample.form_of(columns.time) if columns.time and columns.rest is None else None
+        numbers = all(
+            self.number(f) is not None or f in self.missing
+            for name in columns.channels
+            for f in sample.fields[name][:20]
+        )
+        attempts = [(clock, numbers_only) for numbers_only in (True, False) for clock in clocks]
+        if not numbers:
+            attempts = attempts[len(clocks) :]
+        while attempts:
+            clock, numbers_only = attempts.pop(0)
+            texts = [name for name in (columns.label, columns.key) if name]
+            types = dict.fromkeys(texts, pa.string())
+            types |= dict.fromkeys(columns.channels, pa.float64() if numbers_only else pa.string())
+            if columns.rest_unit == "date":
+                types |= {columns.time: pa.string(), columns.rest: pa.string()}
+            elif columns.rest is not None:
+                types |= {columns.time: pa.int64(), columns.rest: pa.int64()}
+            elif columns.time:
+                types[columns.time] = clock
+            converter = Converter(columns, self.missing, self.decimal or ".")
             try:
+                batches = self._batches(header, columns, types, texts=not numbers_only)
+                if form is not None:
+                    batches = with_stamps(batches, columns.time, form, self.missing)
+                elif columns.rest_unit == "date":
+                    batches = _joined(batches, columns, sample.form_of(columns.time) or "without")
+                elif columns.rest is not None:
+                    batches = with_joined(batches, columns)
+                elif not columns.time:
+                    batches = _counted(batches, rate_hz or 1.0)
+                if not numbers_only:
+                    batches = converter.converted(batches)
                 table = gather(batches, columns, lines)
             except (pa.ArrowException, OverflowError) as error:
-                at = f"In CSV column #{header.index(columns.time)}:"
-                if clock is clocks[-1] or (at not in str(error) and clock is not clocks[0]):
+                again = self._next(str(error), header, columns, clock, attempts, numbers_only)
+                if not again:
                     self._explain(header, columns, sample)
                     raise line_error(self.path, error) from None
+                attempts = again
                 continue
+            except DAMAGE as error:
+                raise no_text(self.path, error) from None
             except NullValueError as error:
                 raise self._empty(error, columns) from None
+            self._check_odd(header, columns)
             if not len(table.clock):
                 raise FileFormatError(
                     f"{self.path} has a header and no rows, expected one per time"
                 )
-            return table, "ns" if pa.types.is_decimal(clock) else unit
-        raise AssertionError("the last clock raises or returns")
+            columns, table = self._usable(header, sample, columns, table, converter)
+            if form == "of day":
+                table = _replaced(table, over_midnight(table.clock))
+            return columns, table, "ns" if pa.types.is_decimal(clock) else unit
+        raise AssertionError("the last attempt raises or returns")
 
-    def _batches(self, header: list[str], columns: Columns, types: dict[str, Any]) -> Iterator[Any]:
+    def _clock_types(self, sample: _CsvSample, columns: Columns, unit: str) -> list[Any]:
+        """Arrow types to read the clock as, the most exact one first."""
+        import pyarrow as pa
+
+        if columns.rest or not columns.time:
+            return [pa.int64()]
+        if sample.form_of(columns.time) is not None:
+            return [pa.string()]
+        fields = sample.fields[columns.time]
+        per_tick = NANOSECONDS_PER[unit]
+        places = len(str(per_tick)) - 1
+        clocks = [pa.int64(), pa.decimal128(38, places), pa.float64()]
+        if per_tick != 10**places:  # minutes, hours and days are no powers of ten
+            del clocks[1]
+        if not all(field.isascii() and field.lstrip("+-").isdecimal() for field in fields):
+            del clocks[0]
+        return clocks
+
+    def _next(
+        self,
+        error: str,
+        header: list[str],
+        columns: Columns,
+        clock: Any,
+        attempts: list[tuple[Any, bool]],
+        numbers_only: bool,
+    ) -> list[tuple[Any, bool]]:
+        """The attempts that are left after an error: with the next clock, or with texts."""
+        of_clock = bool(columns.time) and f"In CSV column #{header.index(columns.time)}:" in error
+        if "In CSV column #" not in error and "decimal" not in error and "overflow" not in error:
+            of_clock = of_clock or not numbers_only
+        if of_clock or not numbers_only:
+            left = [a for a in attempts if a[1] == numbers_only and a[0] != clock]
+            tail = [a for a in attempts if a[1] != numbers_only and a[0] != clock]
+            return [*left, *tail] if left else []
+        return [(clock, False), *(a for a in attempts if not a[1] and a[0] != clock)]
+
+    def _batches(
+        self, header: list[str], columns: Columns, types: dict[str, Any], *, texts: bool
+    ) -> Iterator[Any]:
         import pyarrow.csv as pv
 
-        names = [name or "" for name in header]
-        with pv.open_csv(
-            self.path,
-            read_options=pv.ReadOptions(column_names=names, skip_rows=1, block_size=_BLOCK),
-            parse_options=pv.ParseOptions(delimiter=self.delimiter, newlines_in_values=True),
-            convert_options=pv.ConvertOptions(
-                column_types=types,
-                include_columns=columns.read,
-                null_values=(*MISSING, *_BLANK),
-                decimal_point=self.decimal,
-            ),
-        ) as reader:
+        self.odd.clear()
+        nothing = [*self.missing, *(" " * n for n in range(1, 33))]
+        delimiter = self.layout.delimiter
+        with (
+            closing(self._stream()) as stream,
+            pv.open_csv(
+                stream,
+                read_options=pv.ReadOptions(
+                    column_names=[name or "" for name in header], block_size=_BLOCK
+                ),
+                parse_options=pv.ParseOptions(
+                    delimiter=delimiter,
+                    newlines_in_values=delimiter != " ",
+                    quote_char=False if delimiter == " " else '"',
+                    invalid_row_handler=self._on_odd_row,
+                ),
+                convert_options=pv.ConvertOptions(
+                    column_types=types,
+                    include_columns=columns.read,
+                    null_values=nothing,
+                    strings_can_be_null=False,
+                    decimal_point="." if texts else self.decimal or ".",
+                ),
+            ) as reader,
+        ):
             yield from reader
 
+    def _stream(self) -> Any:
+        file = self.text.bytes_from(self.layout.first)
+        return file if self.layout.delimiter != " " else _Spaced(file)
+
+    def _on_odd_row(self, row: Any) -> str:
+        """Skips comments and, provisionally, one row with another number of fields."""
+        if is_comment(row.text):
+            return "skip"
+        self.odd.append(row.text)
+        return "skip" if len(self.odd) == 1 else "error"
+
+    def _check_odd(self, header: list[str], columns: Columns) -> None:
+        """Notes a row that the end of the file cuts off; another odd row is an error."""
+        if not self.odd:
+            return
+        last = line = 0
+        count = len(header)
+        for number, fields in self._rows():
+            last = number
+            if len(fields) != len(header):
+                line, count = number, len(fields)
+        if line == last and count < len(header) and not self._ends_a_line():
+            self.notes.append(f"the file ends in the middle of line {line}; it is read up to there")
+            return
+        raise self._wrong_count(line, count, header)
+
+    def _wrong_count(self, line: int, count: int, header: list[str]) -> FileFormatError:
+        return FileFormatError(
+            f"{self.path} has {count} fields in line {line}, expected {len(header)}, "
+            f"one per column: {listed(header)}"
+        )
+
+    def _ends_a_line(self) -> bool:
+        last = deque(self.text.lines(), maxlen=1)
+        return bool(last) and last[0].endswith(("\n", "\r"))
+
+    def _usable(
+        self,
+        header: list[str],
+        sample: _CsvSample,
+        columns: Columns,
+        table: Gathered,
+        converter: Converter,
+    ) -> tuple[Columns, Gathered]:
+        """The table without columns that turned out to hold texts.
+
+        Raises:
+            FileFormatError: a field of a column of numbers is none.
+        """
+        texts = converter.texts()
+        if len(texts) == len(columns.channels) and texts:
+            self._explain(header, columns, sample)
+        for c, bad in converter.bad.items():
+            if c in texts:
+                continue
+            last = len(table.clock) - 1
+            if bad.count == 1 and bad.row == last and not self._ends_a_line():
+                self.notes.append(
+                    "the file ends in the middle of a number; its last row is left out"
+                )
+                return columns, _without_last(table)
+            raise self._bad_field(header, columns, bad.row, c, sample)
+        if not texts:
+            return columns, table
+        kept = [c for c in range(len(columns.channels)) if c not in texts]
+        gone = [columns.channels[c] for c in texts]
+        values = table.values[:, kept]
+        return (
+            columns.only(kept, [f"columns of text are left out: {listed(gone, 6)}"]),
+            Gathered(table.clock, table.labels, table.keys, values),
+        )
+
+    def _bad_field(
+        self, header: list[str], columns: Columns, row: int, channel: int, sample: _CsvSample
+    ) -> FileFormatError:
+        name = columns.channels[channel]
+        line, fields = self._row(row)
+        got = fields[header.index(name)]
+        comma = _COMMA.fullmatch(got.strip()) and self.decimal != ","
+        known = [f for f in sample.fields[name] if f and f not in self.missing]
+        if known and all(f in BOOLEANS for f in known):
+            expected = f"one of {', '.join(BOOLEANS)}"
+        elif comma:
+            expected = "a number; if its comma is a decimal point, say so with decimal=','"
+        else:
+            expected = (
+                f"a number; if it means a missing value, say so with missing=[{got.strip()}], or "
+                "leave the column out with without="
+            )
+        return FileFormatError(
+            f"{self.path} has {got[:60]!r} in line {line}, column {name!r}, expected {expected}"
+        )
+
     def _count_lines(self) -> int:
-        """Number of lines including the header, an upper bound of the number of rows."""
+        """Number of lines from the first row on, an upper bound of the number of rows."""
         ends = returns = 0
         last = b""
-        with self.path.open("rb") as file:
-            while block := file.read(_BLOCK):
-                ends += block.count(b"\n")
-                returns += block.count(b"\r") if not ends else 0
-                last = block[-1:]
+        try:
+            with self.text.bytes_from(self.layout.first) as file:
+                while block := file.read(_BLOCK):
+                    ends += block.count(b"\n")
+                    returns += block.count(b"\r") if not ends else 0
+                    last = block[-1:]
+        except DAMAGE as error:
+            raise no_text(self.path, error) from None
         return max(ends, returns) + (last not in b"\r\n")
 
-    def line_of(self, row: int) -> int:
-        """The line in which a row of data ends; the header is line 1."""
-        return next(line for i, (line, _) in enumerate(self._lines()) if i == row + 1)
+    def _row(self, row: int) -> tuple[int, list[str]]:
+        """The line in which a row of data ends, and its fields."""
+        width = len(self.layout.names)
+        whole = (found for found in self._rows() if len(found[1]) == width)
+        return next(found for i, found in enumerate(whole) if i == row)
 
     def _empty(self, error: NullValueError, columns: Columns) -> FileFormatError:
-        line = self.line_of(error.row)
-        if error.column == columns.time:
+        line, _ = self._row(error.row)
+        if error.column in (columns.time, columns.rest):
             return FileFormatError(
                 f"{self.path} has no time in line {line}, column {error.column!r}; drop that row"
             )
@@ -262,76 +534,109 @@ class _CsvFile:
             f"must say which {what} it belongs to"
         )
 
-    def _explain(self, header: list[str], columns: Columns, sample: dict[str, list[str]]) -> None:
-        """Raises an error that names the invalid line and column, if found."""
-        first = _first_time(sample, columns)
+    def _explain(self, header: list[str], columns: Columns, sample: _CsvSample) -> None:
+        """Raises an error that names the invalid line and column of times, if found."""
+        first = next((f for f in sample.fields.get(columns.time, []) if f not in self.missing), "")
         form = form_of(first)
-        truths = [name for name in columns.channels if _holds_booleans(sample[name])]
-        for line, fields in self._lines():
+        for line, fields in self._rows():
             if len(fields) != len(header):
-                raise FileFormatError(
-                    f"{self.path} has {len(fields)} fields in line {line}, expected {len(header)}, "
-                    f"one per column: {listed(header)}"
-                )
-            for name, field in zip(header, fields, strict=True):
-                if line == 1 or name not in columns.read or field in MISSING or not field.strip():
+                raise self._wrong_count(line, len(fields), header)
+            for name, got in zip(header, fields, strict=True):
+                text = got.strip()
+                if not name or name not in (columns.time, columns.rest):
                     continue
-                number = self.number(field)
-                comma = number is None and self.decimal == "." and _COMMA.fullmatch(field.strip())
-                if name in (columns.time, *columns.channels) and comma:
+                if not text or text in self.missing:
+                    raise FileFormatError(
+                        f"{self.path} has no time in line {line}, column {name!r}; drop that row"
+                    )
+                number = self.number(text)
+                if form is None and number is None and _COMMA.fullmatch(text):
                     expected = "a number; if its comma is a decimal point, say so with decimal=','"
-                elif name == columns.time:
-                    fits = number is not None if form is None else form_of(field.strip()) == form
-                    expected = "" if fits else expected_after(first)
-                elif name in truths:
-                    expected = "" if field in _BOOLEANS else f"one of {', '.join(_BOOLEANS)}"
-                elif name in columns.channels and number is None:
-                    expected = "a number; choose the columns that are channels with channels="
+                elif columns.rest is not None:
+                    fits = form_of(text) is not None if form else number is not None
+                    expected = "" if fits else "a part of a time, as in the rows before"
                 else:
-                    continue
+                    fits = number is not None if form is None else form_of(text) == form
+                    expected = "" if fits else expected_after(first)
                 if expected:
                     raise FileFormatError(
-                        f"{self.path} has {field!r} in line {line}, column {name!r}, expected "
+                        f"{self.path} has {got[:60]!r} in line {line}, column {name!r}, expected "
                         f"{expected}"
                     )
 
-    def number(self, field: str) -> float | None:
+    def number(self, text: str) -> float | None:
         """The number in a field, or None."""
-        if self.decimal != ".":
-            field = field.replace(".", "?").replace(self.decimal, ".")
-        try:
-            number = float(field)
-        except ValueError:
-            return None
-        # Python allows _ between digits, and digits of other scripts; CSV does not.
-        return number if field.isascii() and "_" not in field else None
+        return number_in(text, self.decimal or ".")
 
-    def _lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Line numbers and fields, header included; empty lines are skipped, as pyarrow does."""
-        try:
-            with self.path.open(encoding="utf-8-sig", newline="") as file:
-                reader = csv.reader(file, delimiter=self.delimiter)
-                for fields in reader:
-                    if fields:
-                        yield reader.line_num, fields
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise FileFormatError(
-                f"{self.path} can't be read as CSV ({error}); it must be text in UTF-8"
-            ) from None
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Line numbers and fields of the rows, without comments."""
+        for line, fields in self.text.rows(self.layout.delimiter):
+            odd = len(fields) != len(self.layout.names)
+            if line >= self.layout.first and not (odd and is_comment(fields[0])):
+                yield line, fields
 
 
-def _first_time(sample: dict[str, list[str]], columns: Columns) -> str:
-    """The first non-empty field of the clock, or an empty one."""
-    return next((field for field in sample[columns.time] if field not in MISSING), "")
+def _is_time(text: str) -> bool:
+    return form_of(text) is not None or number_in(text, ".") is not None
 
 
-def _type_of(fields: list[str]) -> Any:
-    """The Arrow type of a channel by its first fields: booleans by name, else numbers."""
+def _counts(fields: list[str]) -> bool:
+    """Whether fields count rows, from any number on."""
+    first = int(fields[0]) if fields and fields[0].isdecimal() else 0
+    return fields == [str(first + i) for i in range(len(fields))]
+
+
+def _joined(batches: Iterator[Any], columns: Columns, form: str) -> Iterator[Any]:
+    """Batches with nanoseconds in place of a date and a time of day."""
+    for batch in batches:
+        stamps = date_and_time(batch.column(columns.time), batch.column(columns.rest), form)
+        yield batch.set_column(batch.schema.get_field_index(columns.time), columns.time, stamps)
+
+
+def _counted(batches: Iterator[Any], rate_hz: float) -> Iterator[Any]:
+    """Batches with a column without a name: nanoseconds of rows at a fixed rate."""
     import pyarrow as pa
 
-    return pa.bool_() if _holds_booleans(fields) else pa.float64()
+    start = 0
+    for batch in batches:
+        rows = np.arange(start, start + batch.num_rows)
+        start += batch.num_rows
+        stamps = np.rint(rows * (1e9 / rate_hz)).astype(np.int64)
+        yield batch.append_column("", pa.array(stamps))
 
 
-def _holds_booleans(fields: list[str]) -> bool:
-    known = [field for field in fields if field not in MISSING]
-    return bool(known) and all(field in _BOOLEANS for field in known)
+def _replaced(table: Gathered, clock: NDArray[Any]) -> Gathered:
+    return Gathered(clock, table.labels, table.keys, table.values)
+
+
+def _without_last(table: Gathered) -> Gathered:
+    from offbeat.data.readers.columns import Coded
+
+    labels, keys = (
+        None if coded is None else Coded(coded.codes[:-1], coded.texts)
+        for coded in (table.labels, table.keys)
+    )
+    return Gathered(table.clock[:-1], labels, keys, table.values[:-1])
+
+
+class _Spaced:
+    """A stream of text with one blank between fields, and no comments."""
+
+    closed = False
+
+    def __init__(self, file: Any) -> None:
+        self.file = file
+
+    def read(self, size: int = -1) -> bytes:
+        while lines := self.file.readlines(size if size > 0 else -1):
+            text = b"".join(
+                b" ".join(line.split()) + b"\n"
+                for line in lines
+                if line.strip() and not line.lstrip().startswith((b"#", b"%", b"//"))
+            )
+            if text:
+                return text
+        return b""
+
+    def close(self) -> None:
+        self.file.close()

@@ -1,0 +1,124 @@
+"""Fields of text tables: numbers, booleans, and missing values in the forms programs write."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from offbeat.data.readers.columns import Columns
+
+MISSING = (
+    *("", "NaN", "nan", "NAN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "Null", "None"),
+    *("none", "nil", "NaT", "-", "--", "---", "?", ".", "-nan", "-NaN", "+nan", "nan(ind)"),
+    *("-nan(ind)", "NaN(ind)", "-NaN(ind)", "nan(snan)", "1.#QNAN", "-1.#QNAN", "1.#IND"),
+    *("-1.#IND", "1.#SNAN", "-1.#SNAN", "#DIV/0!", "#VALUE!", "#NUM!", "#REF!", "#NULL!"),
+    *("#NAME?", "#N/A N/A", "*", "missing", "Missing", "undefined"),
+)
+"""Fields whose value is not known."""
+
+BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
+
+_NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$|^[+-]?(inf|infinity|nan)$"
+_INFINITE = r"^([+-]?)1\.#(INF|inf).*$"
+_THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
+_GROUPED_BY_POINTS = re.compile(r"[+-]?[1-9][0-9]{0,2}(\.[0-9]{3})+,[0-9]+")
+_IS_NUMBER = re.compile(_NUMBER, re.IGNORECASE)
+
+
+def number_in(text: str, decimal: str) -> float | None:
+    """The number in a field, or None."""
+    text = text.strip()
+    if decimal != ".":
+        if _GROUPED_BY_POINTS.fullmatch(text):
+            text = text.replace(".", "")
+        text = text.replace(".", "?").replace(decimal, ".")
+    elif re.fullmatch(_THOUSANDS[1:-1], text):
+        text = text.replace(",", "")
+    # Python allows _ between digits, and digits of other scripts; CSV does not.
+    return float(text) if _IS_NUMBER.match(text) else None
+
+
+@dataclass
+class Bad:
+    """Fields of a column that are no numbers.
+
+    Attributes:
+        row: of the first one.
+        count: of all.
+    """
+
+    row: int
+    count: int = 0
+
+
+@dataclass
+class Converter:
+    """Converts columns of texts to numbers, batch by batch, and counts what is none.
+
+    Args:
+        columns: description of the table.
+        missing: texts of missing values.
+        decimal: the decimal separator.
+        bad: fields that are no numbers, by the position of their channel.
+        known: fields that are numbers, by channel.
+        rows: converted so far.
+    """
+
+    columns: Columns
+    missing: Sequence[str]
+    decimal: str
+    bad: dict[int, Bad] = field(default_factory=dict)
+    known: dict[int, int] = field(default_factory=dict)
+    rows: int = 0
+
+    def converted(self, batches: Iterator[Any]) -> Iterator[Any]:
+        """Yields batches whose channels are numbers, null where there is none."""
+        for batch in batches:
+            for c, name in enumerate(self.columns.channels):
+                at = batch.schema.get_field_index(name)
+                batch = batch.set_column(at, name, self._numbers(c, batch.column(at)))
+            self.rows += batch.num_rows
+            yield batch
+
+    def texts(self) -> list[int]:
+        """Channels of which more than half of the known fields are no numbers."""
+        return [c for c, bad in self.bad.items() if bad.count > self.known.get(c, 0)]
+
+    def _numbers(self, c: int, column: Any) -> Any:
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        texts = pc.utf8_trim_whitespace(column)
+        nothing = pa.scalar(None, pa.string())
+        texts = pc.if_else(pc.is_in(texts, pa.array(self.missing, pa.string())), nothing, texts)
+        if self.decimal != ".":
+            grouped = pc.match_substring_regex(texts, f"^{_GROUPED_BY_POINTS.pattern}$")
+            texts = pc.if_else(grouped, pc.replace_substring(texts, ".", ""), texts)
+            texts = pc.replace_substring(pc.replace_substring(texts, ".", "?"), self.decimal, ".")
+        try:
+            numbers = texts.cast(pa.float64())
+        except pa.ArrowInvalid:
+            numbers = self._one_by_one(c, texts)
+        self.known[c] = self.known.get(c, 0) + len(numbers) - numbers.null_count
+        return numbers
+
+    def _one_by_one(self, c: int, texts: Any) -> Any:
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        lower = pc.utf8_lower(texts)
+        texts = pc.if_else(pc.equal(lower, "true"), "1", texts)
+        texts = pc.if_else(pc.equal(lower, "false"), "0", texts)
+        texts = pc.replace_substring_regex(texts, _INFINITE, r"\1inf")
+        if self.decimal == ".":
+            grouped = pc.match_substring_regex(texts, _THOUSANDS)
+            texts = pc.if_else(grouped, pc.replace_substring(texts, ",", ""), texts)
+        fits = pc.match_substring_regex(texts, _NUMBER, ignore_case=True)
+        bad = pc.and_(pc.is_valid(texts), pc.invert(pc.fill_null(fits, False)))
+        count = pc.sum(bad).as_py() or 0
+        if count:
+            first = self.rows + pc.index(bad, True).as_py()
+            self.bad.setdefault(c, Bad(first)).count += count
+        return pc.if_else(fits, texts, pa.scalar(None, pa.string())).cast(pa.float64())
