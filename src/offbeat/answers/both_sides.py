@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
 from offbeat.baselines.base import Array, Baseline, fit_baseline
+from offbeat.baselines.folds import cross_fitted
 from offbeat.baselines.history import AgeBins
 from offbeat.baselines.stack import (
     arrays_of,
-    cross_fitted,
     independent_tasks,
     joined,
     members_of,

@@ -16,8 +16,10 @@ from offbeat.baselines.base import (
     checked_causal,
     fit_baseline,
 )
+from offbeat.baselines.folds import cross_fitted, folds_of
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.kalman_fit import ChannelKalman, ChannelKalmanLong, ChannelSmoother
+from offbeat.baselines.ridge import Ridge
 from offbeat.baselines.simple import (
     ConstantVelocity,
     DampedSlope,
@@ -44,11 +46,14 @@ __all__ = [
     "Linear",
     "Mean",
     "Pchip",
+    "Ridge",
     "RunningMean",
     "causal_baselines",
+    "cross_fitted",
     "fill",
     "fillers",
     "fit_baseline",
+    "folds_of",
     "forecast",
     "forecasters",
 ]

@@ -21,11 +21,11 @@ from offbeat.baselines.base import (
     padded,
     stepped,
 )
+from offbeat.baselines.folds import cross_fitted
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.simple import as_kind
 from offbeat.baselines.weights import Errors, simplex_weights
-from offbeat.data.tasks import take_tasks
 from offbeat.data.trajectory import Dataset
 
 ACTIVITY = (-1.5, -0.5)
@@ -336,36 +336,6 @@ def fit_stack(
     held_out = stack.mix(later, validation)
     stack.weights = simplex_weights(joined(errors), train.channels)
     return stack, cells[1], held_out
-
-
-def cross_fitted(name: str, tasks: Dataset, folds: int = 3) -> list[Array]:
-    """Predictions of tasks by baselines that were fitted to others.
-
-    Args:
-        name: of a baseline.
-        tasks: from `draw_tasks`; those of one source trajectory are in one fold, and where there
-            are fewer sources than folds, those near each other in time.
-        folds: number of fits.
-    """
-    sources = tasks.meta.get("tasks") or [["", i, 0] for i in range(len(tasks))]
-    order = sorted(range(len(tasks)), key=lambda i: (sources[i][1], sources[i][2]))
-    many = len({s[1] for s in sources}) >= folds
-    fold = np.empty(len(tasks), dtype=np.int64)
-    if many:
-        ranks = {source: k % folds for k, source in enumerate(sorted({s[1] for s in sources}))}
-        fold[:] = [ranks[s[1]] for s in sources]
-    else:
-        fold[order] = np.arange(len(tasks)) * folds // len(tasks)
-    results: list[Array] = [np.empty(0)] * len(tasks)
-    for k in range(folds):
-        inside, outside = np.flatnonzero(fold == k), np.flatnonzero(fold != k)
-        if not len(inside):
-            continue
-        kept = outside if len(outside) else inside
-        fitted = fit_baseline(name, take_tasks(tasks, kept))
-        for i, p in zip(inside.tolist(), fitted.predict(take_tasks(tasks, inside)), strict=True):
-            results[i] = p
-    return results
 
 
 def joined(errors: Sequence[Errors]) -> Errors:

@@ -1,0 +1,359 @@
+"""Ridge regression on what was observed, one fit per channel and time since observation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offbeat.baselines.base import BASELINES, Array, CausalBaseline, State, namespace, padded
+from offbeat.baselines.folds import folds_of
+from offbeat.baselines.held_out import held_out_ridge
+from offbeat.baselines.history import AgeBins, History, longest_age, typical_gap
+from offbeat.baselines.simple import as_kind
+from offbeat.data.trajectory import Dataset
+
+SPANS = (1, 2, 4)
+"""Intervals that the slopes span."""
+
+AVERAGES = 2
+"""Exponential averages of each channel."""
+
+FOLLOWED = 16
+"""Most channels whose motion since a channel was observed is followed."""
+
+STATES, CELLS = 50_000, 1_000_000
+"""Most states of the tasks that a fit uses, and most of them times channels."""
+
+EXAMPLES = 6_000
+"""Most examples of a channel in a bin."""
+
+FOLDS = 4
+"""Groups of source trajectories that penalties are chosen on."""
+
+FURTHEST = 10.0
+"""Largest motion of a channel since an observation, in units of its scale."""
+
+
+class Ridge(CausalBaseline):
+    r"""Ridge regression of the change of each channel since its last observation.
+
+    For a channel whose last value is :math:`x`, observed :math:`a` s ago, the prediction is
+    :math:`x + s (r\, w^T \phi + v^T \psi(r))`, with the channel's scale :math:`s`, the relative age
+    :math:`r`, which is :math:`a` over the middle of its bin, features :math:`\phi` of all channels
+    and :math:`\psi` of its own. Weights differ between the bins of `AgeBins`, and in each of them
+    between an outage of all channels and one of this channel, where others were observed in the
+    second half of :math:`a`. A channel that was not observed yet has further weights, :math:`r = 1`
+    and the training mean as its last value.
+
+    The features of a channel are its last value, its slopes over 1, 2 and 4 intervals, and its last
+    value less exponential averages over 4 typical gaps and over the longest age. :math:`\psi` is
+    those of the channel, with and without the factor :math:`r`, and the motion of other channels
+    since it was observed. All are limited to what training had, with a margin, and so are
+    predictions.
+
+    Weights are those of least squares with relative errors, :math:`1 / r`, on every state of the
+    tasks and some later rows. They come in steps, each fitted to what the one before left: own
+    features in an outage of all channels, then features of all; then the same for an outage of one.
+    The penalty of every step is chosen on held-out trajectories (`held_out_ridge`); where nothing
+    helps, the prediction is the last value.
+    """
+
+    flexible = True
+
+    edges: Array  # (bins,) s, of AgeBins
+    averages: Array  # (averages,) s, time constants
+    followed: NDArray[np.int64]  # (channels, followed) whose motion a channel uses
+    limits: Array  # (2, channels * features) lowest and highest
+    spread: Array  # (channels * features,)
+    weight: Array  # (2 * bins + 1, shared features, channels)
+    own_weight: Array  # (2 * bins + 1, channels, own features)
+    bound: Array  # (2, channels) lowest and highest prediction
+
+    history = History(max(SPANS) + 1)
+
+    def arrays(self) -> dict[str, Array]:
+        """See `Baseline`."""
+        names = ("edges", "averages", "followed", "limits", "spread")
+        fitted = ("weight", "own_weight", "bound")
+        return {**super().arrays(), **{name: getattr(self, name) for name in (*names, *fitted)}}
+
+    # --- state --------------------------------------------------------------------------------
+
+    def start(self, like: Any) -> State:
+        """See `CausalBaseline`.
+
+        Besides the history, `average` (batch, channels, averages) and `then` (batch, channels,
+        followed), the last values of other channels when this one was observed, standardised.
+        """
+        xp = namespace(like)
+        return {
+            **self.history.start(like),
+            "average": xp.stack([like] * len(self.averages), -1),
+            "then": (0.0 * like)[..., _index(self.followed, xp)],
+        }
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        """See `CausalBaseline`."""
+        xp = namespace(values)
+        at = mask[..., None]
+        since = (time - state["times"][..., 0])[..., None]
+        kept = xp.exp(-since / as_kind(self.averages, values)) * (state["count"] > 0)[..., None]
+        average = values[..., None] + kept * (state["average"] - values[..., None])
+        after = self.history.observe(state, time, values, mask)
+        now = self._standardised(after)[..., _index(self.followed, xp)]
+        return {
+            **after,
+            "average": xp.where(at, average, state["average"]),
+            "then": xp.where(at, now, state["then"]),
+        }
+
+    def _standardised(self, state: State) -> Any:
+        """(batch, channels) last values; 0 where there was none."""
+        mean = as_kind(self.mean, state["count"])
+        return (History.last(state, mean) - mean) / as_kind(self.scale, state["count"])
+
+    def features(self, state: State) -> Any:
+        """(batch, channels, features) of every channel; 0 where it was not observed."""
+        xp = namespace(state["count"])
+        scale = as_kind(self.scale, state["count"])
+        moved = (state["values"][..., :1] - state["average"]) / scale[..., None]
+        columns = [
+            self._standardised(state),
+            *(History.slope(state, span) / scale for span in SPANS),
+            *(moved[..., i] for i in range(len(self.averages))),
+        ]
+        return xp.where((state["count"] > 0)[..., None], xp.stack(columns, -1), 0.0)
+
+    def moved(self, state: State) -> Any:
+        """(batch, channels, followed) motion of others since a channel was observed."""
+        xp = namespace(state["count"])
+        now = self._standardised(state)[..., _index(self.followed, xp)]
+        return xp.clip(now - state["then"], -FURTHEST, FURTHEST)
+
+    # --- predictions --------------------------------------------------------------------------
+
+    def read(self, state: State, time: Any) -> Any:
+        """See `CausalBaseline`."""
+        like = state["count"]
+        xp = namespace(like)
+        features = self._limited(self.features(state))
+        at, relative = self._placed(History.age(state, time))
+        own = _own(features, self.moved(state), relative)
+        channel = np.arange(len(self.mean)) if xp is np else xp.arange(len(self.mean))
+        change = (own * as_kind(self.own_weight, like)[at, channel]).sum(-1)
+        bins, inputs, channels = self.weight.shape
+        weight = as_kind(self.weight.transpose(1, 0, 2).reshape(inputs, -1), like)
+        each = (self.shared(features) @ weight).reshape(-1, bins, channels)
+        for i in range(bins):
+            change = change + xp.where(at == i, relative * each[:, i], 0.0)
+        last = History.last(state, as_kind(self.mean, like))
+        predicted = last + change * as_kind(self.scale, like)
+        return xp.clip(predicted, as_kind(self.bound[0], like), as_kind(self.bound[1], like))
+
+    def shared(self, features: Any) -> Any:
+        """(batch, shared features) those of all channels, and a 1."""
+        flat = features.reshape(features.shape[0], -1)
+        xp = namespace(flat)
+        return xp.concatenate([flat, xp.ones_like(flat[:, :1])], -1)
+
+    def _limited(self, features: Any) -> Any:
+        flat = features.reshape(features.shape[0], -1)
+        low, high = (as_kind(limit, flat) for limit in self.limits)
+        flat = namespace(flat).clip(flat, low, high) / as_kind(self.spread, flat)
+        return flat.reshape(features.shape)
+
+    def _placed(self, age: Any) -> tuple[Any, Any]:
+        """Which weights are for an age, and the age over the middle of its bin."""
+        xp = namespace(age)
+        bins = AgeBins(self.edges)
+        seen = age < np.inf
+        age = xp.clip(age, 0.0, float(self.edges[-1]))
+        at = bins.of_age(age)
+        relative = age / as_kind(bins.middle, age)[at]
+        others = xp.amin(age, -1)[..., None] < 0.5 * age
+        at = xp.where(others, at + len(bins), at)
+        return (
+            xp.where(seen, at, 0 * at + 2 * len(bins)),
+            xp.where(seen, relative, xp.ones_like(relative)),
+        )
+
+    # --- fitting ------------------------------------------------------------------------------
+
+    def estimate(self, tasks: Dataset) -> None:
+        """See `Baseline`."""
+        gap, longest = typical_gap(tasks), longest_age(tasks)
+        self.edges = AgeBins.of(tasks).edges
+        self.averages = np.geomspace(4 * gap, max(longest, 8 * gap), AVERAGES)
+        likeness = _likeness(tasks)
+        order = np.argsort(-likeness, axis=1, kind="stable")
+        self.followed = np.ascontiguousarray(order[:, 1 : FOLLOWED + 1])
+        found = _examples(self, tasks)
+        self._measure(found.features)
+        features = self._limited(found.features).astype(np.float32)
+        self._solve(found, features, likeness)
+        known = [np.where(t.known, t.values, np.nan) for t in tasks]
+        every = np.concatenate([*known, np.where(np.isfinite(self.mean), self.mean, 0.0)[None]])
+        low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
+        self.bound = np.stack([low - 0.5 * (high - low), high + 0.5 * (high - low)])
+
+    def _measure(self, features: Array) -> None:
+        """Limits and spreads of the features."""
+        flat = features.reshape(len(features), -1)
+        low, high = np.quantile(flat, [0.0005, 0.9995], axis=0)
+        self.limits = np.stack([low - 0.5 * (high - low), high + 0.5 * (high - low)])
+        spread = np.clip(flat, *self.limits).std(axis=0, dtype=np.float64)
+        self.spread = np.where(spread > 0, spread, 1.0)
+
+    def _solve(self, found: Examples, features: Array, likeness: Array) -> None:
+        bins, channels = len(self.edges), features.shape[1]
+        size = 2 + 2 * features.shape[2] + self.followed.shape[1]
+        self.own_weight = np.zeros((2 * bins + 1, channels, size))
+        self.weight = np.zeros((2 * bins + 1, self.shared(features[:1]).shape[1], channels))
+        for b in range(2 * bins + 1):
+            if bins <= b < 2 * bins:
+                self.own_weight[b] = self.own_weight[b - bins]
+                self.weight[b] = self.weight[b - bins]
+            for group, rows in found.together(b):
+                at = found.state[rows]
+                columns = self._columns(group, likeness, features.shape[2])
+                shared = self.shared(features[at])[:, columns].astype(np.float64)
+                left = np.empty((len(rows), len(group)))
+                for i, c in enumerate(group):
+                    r = found.relative[rows, c].astype(np.float64)[:, None]
+                    own = _own(features[at, c], found.moved[at, c], r[:, 0]) / r
+                    target = found.change[rows, c] / r[:, 0]
+                    target = target - own @ self.own_weight[b, c]
+                    target = target - shared @ self.weight[b, columns, c]
+                    step = held_out_ridge(own, target[:, None], found.fold[at])[:, 0]
+                    self.own_weight[b, c] += step
+                    left[:, i] = target - own @ step
+                self.weight[b][columns[:, None], group] += held_out_ridge(
+                    shared, left, found.fold[at]
+                )
+
+    def _columns(self, group: list[int], likeness: Array, each: int) -> NDArray[np.int64]:
+        """The shared features that predict these channels: of 32 channels, of less in wide logs."""
+        channels = len(likeness)
+        most = max(len(group), int(np.clip(1000 // channels, 12, 32)))
+        inputs = np.sort(np.argsort(-likeness[group].max(axis=0), kind="stable")[:most])
+        columns = (inputs[:, None] * each + np.arange(each)).ravel()
+        return np.append(columns, channels * each)
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """States of tasks, and what later rows were.
+
+    Attributes:
+        features: (states, channels, features) of `Ridge.features`.
+        moved: (states, channels, followed).
+        fold: (states,) group of trajectories.
+        state: (examples,) the state that an example predicts from.
+        at: (examples, channels) which weights it uses; -1 where it is no example.
+        relative: (examples, channels) age over the middle of its bin.
+        change: (examples, channels) since the last observation, in units of the scale.
+    """
+
+    features: Array
+    moved: Array
+    fold: NDArray[np.int64]
+    state: NDArray[np.int64]
+    at: NDArray[np.int8]
+    relative: Array
+    change: Array
+
+    def together(self, b: int) -> list[tuple[list[int], NDArray[np.int64]]]:
+        """Channels with the same examples of a bin, and at most `EXAMPLES` of these."""
+        groups: dict[bytes, list[int]] = {}
+        here = self.at == b
+        for c in range(here.shape[1]):
+            groups.setdefault(np.packbits(here[:, c]).tobytes(), []).append(c)
+        found = []
+        for group in groups.values():
+            rows = np.flatnonzero(here[:, group[0]])
+            if len(rows) > EXAMPLES:
+                rows = np.sort(np.random.default_rng(b).choice(rows, EXAMPLES, replace=False))
+            if len(rows):
+                found.append((group, rows))
+        return found
+
+
+def _examples(baseline: Ridge, tasks: Dataset) -> Examples:
+    """Some states before a row; each predicts that row, and two later ones as if cut off.
+
+    The distance of the later ones is log-uniform.
+    """
+    random = np.random.default_rng(0)
+    fraction = min(STATES, CELLS / tasks.channels) / sum(t.rows for t in tasks)
+    folds = folds_of(tasks, FOLDS)
+    states: list[tuple[NDArray[Any], ...]] = []
+    reads: list[tuple[NDArray[Any], ...]] = []
+    first = count = 0
+    for rows in padded(tasks):
+        lengths = np.array(rows.lengths)
+        state = baseline.start(np.zeros((len(lengths), tasks.channels)))
+        for i in range(int(lengths.max())):
+            chosen = np.flatnonzero((random.random(len(lengths)) < fraction) & (i < lengths))
+            part = {name: array[chosen] for name, array in state.items()}
+            last = History.last(part, baseline.mean)
+            features, moved = baseline.features(part), baseline.moved(part)
+            fold = folds[first + chosen]
+            states.append((features.astype(np.float32), moved.astype(np.float32), fold))
+            longest = lengths[chosen] - 1 - i
+            for draw in (np.zeros(len(chosen)), *random.random((2, len(chosen)))):
+                to = i + np.minimum(((longest + 2.0) ** draw).astype(int) - 1, longest)
+                age = History.age(part, rows.times[chosen, to, None])
+                at, relative = baseline._placed(age)
+                counted = rows.known[chosen, to] & (relative > 0.2)
+                counted &= (age <= baseline.edges[-1]) | np.isinf(age)
+                change = (rows.values[chosen, to] - last) / baseline.scale
+                reads.append(
+                    (
+                        count + np.arange(len(chosen)),
+                        np.where(counted, at, -1).astype(np.int8),
+                        relative.astype(np.float32),
+                        np.clip(change, -FURTHEST, FURTHEST).astype(np.float32),
+                    )
+                )
+            count += len(chosen)
+            time = rows.times[:, i, None]
+            state = baseline.observe(state, time, rows.values[:, i], rows.observed[:, i])
+        first += len(lengths)
+    return Examples(
+        *(np.concatenate(parts) for parts in zip(*states, strict=True)),
+        *(np.concatenate(parts) for parts in zip(*reads, strict=True)),
+    )
+
+
+def _own(features: Any, moved: Any, relative: Any) -> Any:
+    """(..., own features) of the channel itself and of the motion of others."""
+    xp = namespace(relative)
+    relative = relative[..., None]
+    one = xp.ones_like(relative)
+    return xp.concatenate([relative, one, relative * features, features, moved], -1)
+
+
+def _likeness(tasks: Dataset) -> Array:
+    """(channels, channels) absolute correlation of how the last values move; 2 with itself."""
+    product = np.zeros((tasks.channels, tasks.channels))
+    for t in tasks:
+        row = np.maximum.accumulate(np.where(t.observed, np.arange(t.rows)[:, None], 0), axis=0)
+        seen = np.logical_or.accumulate(t.observed, axis=0)
+        held = np.take_along_axis(np.where(t.observed, t.values, 0.0), row, axis=0)
+        moved = np.where(seen[:-4], held[4:] - held[:-4], 0.0)
+        product += moved.T @ moved
+    spread = np.sqrt(np.diag(product))
+    likeness = np.abs(product) / np.where(spread > 0, spread, 1.0)
+    likeness = likeness / np.where(spread > 0, spread, 1.0)[:, None]
+    np.fill_diagonal(likeness, 2.0)
+    return likeness
+
+
+def _index(index: NDArray[np.int64], xp: Any) -> Any:
+    return index if xp is np else xp.as_tensor(index)
+
+
+BASELINES.register("ridge", Ridge)

@@ -1,0 +1,217 @@
+"""Ridge regression baselines: linear systems with a known best predictor, and other libraries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import offbeat as ob
+from offbeat.baselines import cross_fitted, fit_baseline, folds_of
+from offbeat.baselines.held_out import held_out_ridge
+from offbeat.data.tasks import TaskConfig, draw_tasks, take_tasks
+
+GAP = 0.01
+
+
+def cut(dataset: ob.Dataset, row: int, channels: tuple[int, ...] | None = None) -> ob.Dataset:
+    """Everything of these channels masked from a row on."""
+    tasks = []
+    for t in dataset:
+        observed = t.observed.copy()
+        observed[row:, slice(None) if channels is None else list(channels)] = False
+        tasks.append(replace(t, observed=observed))
+    return ob.Dataset(tuple(tasks))
+
+
+def rms(array: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(array))))
+
+
+# x[t] = 1.6 x[t-1] - 0.7 x[t-2] + e
+SECOND_ORDER = np.array([[1.6, -0.7], [1.0, 0.0]])
+
+
+def second_order(count: int, seed: int) -> ob.Dataset:
+    random = np.random.default_rng(seed)
+    made = []
+    for _ in range(count):
+        x = np.zeros(120)
+        for i in range(2, len(x)):
+            x[i] = SECOND_ORDER[0] @ x[[i - 1, i - 2]] + random.standard_normal()
+        made.append(ob.Trajectory(GAP * np.arange(70), 5 + x[50:, None]))
+    return ob.Dataset(tuple(made))
+
+
+def test_a_second_order_process_gets_its_best_prediction_at_every_horizon():
+    train = second_order(400, seed=0)
+    fitted = fit_baseline("ridge", cut(train, 64))
+    test = cut(second_order(200, seed=1), 60)
+    predicted = np.stack([p[:, 0] for p in fitted.predict(test)]) - 5
+    x = np.stack([t.values[:, 0] for t in test]) - 5
+    best = np.stack([x[:, 1:-1], x[:, :-2]], -1) @ SECOND_ORDER[0]
+    spread = rms(x)
+    assert rms(predicted[:, 10:60] - best[:, 8:58]) < 0.015 * spread
+    power = SECOND_ORDER
+    for row in (60, 61, 62):
+        ahead = x[:, [59, 58]] @ power[0]
+        assert rms(predicted[:, row] - ahead) < 0.05 * spread
+        power = power @ SECOND_ORDER
+
+
+def test_a_channel_that_another_one_drives_is_predicted_from_it():
+    # The first channel follows the second one, which is white noise but for a lag of one row.
+    random = np.random.default_rng(0)
+    made = []
+    for _ in range(300):
+        driver = random.standard_normal(61)
+        driven = np.concatenate([[0.0], driver[:-1]]) + 0.1 * random.standard_normal(61)
+        made.append(ob.Trajectory(GAP * np.arange(60), np.stack([driven, driver], -1)[1:]))
+    data = ob.Dataset(tuple(made))
+    fitted = fit_baseline("ridge", data[:200])
+    errors = np.concatenate(
+        [(t.values - p)[5:] for t, p in zip(data[200:], fitted.predict(data[200:]), strict=True)]
+    )
+    assert rms(errors[:, 0]) == pytest.approx(0.1, rel=0.05)
+    assert rms(errors[:, 1]) == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_silent_channel_follows_one_that_is_still_observed():
+    random = np.random.default_rng(0)
+    made = []
+    for _ in range(200):
+        walk = np.cumsum(random.standard_normal(60))
+        values = np.stack([walk, -3 * walk + 7], -1)
+        made.append(ob.Trajectory(GAP * np.arange(60), values))
+    data = ob.Dataset(tuple(made))
+    silent = ob.Dataset(tuple(cut(data[i : i + 1], 20 + i % 35, (1,))[0] for i in range(len(data))))
+    fitted = fit_baseline("ridge", silent[:150])
+    held = fit_baseline("last_value", silent[:150])
+    test = cut(data[150:], 30, (1,))
+    late = [
+        rms(
+            np.stack([(t.values - p)[35:50, 1] for t, p in zip(test, b.predict(test), strict=True)])
+        )
+        for b in (fitted, held)
+    ]
+    # What is left is the step of the first channel since its last row, 3 per row.
+    assert late[0] < 3.5
+    assert late[1] > 8
+
+
+def test_noise_is_predicted_no_worse_than_by_its_mean():
+    random = np.random.default_rng(0)
+    data = ob.Dataset(
+        tuple(
+            ob.Trajectory(GAP * np.arange(60), 4 + random.standard_normal((60, 2)))
+            for _ in range(60)
+        )
+    )
+    fitted = fit_baseline("ridge", data[:40])
+    errors = np.concatenate(
+        [t.values - p for t, p in zip(data[40:], fitted.predict(data[40:]), strict=True)]
+    )
+    assert rms(errors) < 1.03
+
+
+def test_outliers_and_long_times_give_bounded_predictions():
+    fitted = fit_baseline("ridge", cut(second_order(100, seed=0), 60))
+    t = second_order(1, seed=1)[0]
+    values = t.values.copy()
+    values[50] = 1e9
+    times = np.append(t.times, [1e3, 1e6])
+    values = np.vstack([values, [[np.nan], [np.nan]]])
+    asked = ob.Dataset((ob.Trajectory(times, values),))
+    predicted = fitted.predict(asked)[0]
+    assert fitted.bound[0, 0] <= predicted.min()
+    assert predicted.max() <= fitted.bound[1, 0]
+    # Beyond the longest age of training, the prediction stays.
+    assert predicted[-1, 0] == predicted[-2, 0]
+
+
+def test_predictions_do_not_change_with_units():
+    tasks = cut(second_order(50, seed=0), 60)
+    other = ob.Dataset(tuple(replace(t, values=1e3 * t.values - 40) for t in tasks))
+    a = fit_baseline("ridge", tasks).predict(tasks)
+    b = fit_baseline("ridge", other).predict(other)
+    for one, two in zip(a, b, strict=True):
+        assert two == pytest.approx(1e3 * one - 40, rel=1e-4)
+
+
+# --- held-out ridge regression --------------------------------------------------------------------
+
+
+def problem(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(seed)
+    x = random.standard_normal((120, 12))
+    y = x[:, :3] @ random.standard_normal((3, 2)) + [0.5, 4.0] * random.standard_normal((120, 2))
+    return x, y, np.repeat(np.arange(4), 30)
+
+
+def test_weights_are_those_of_scikit_learn():
+    linear = pytest.importorskip("sklearn.linear_model")
+    x, y, groups = problem()
+    expected = linear.Ridge(alpha=0.1 * len(x), fit_intercept=False).fit(x, y).coef_.T
+    assert held_out_ridge(x, y, groups, (0.1,)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_penalty_is_that_of_a_search_over_groups():
+    linear = pytest.importorskip("sklearn.linear_model")
+    x, y, groups = problem()
+    penalties = (1e-3, 1e-2, 1e-1, 1.0)
+    for target in range(2):
+        errors = []
+        for penalty in penalties:
+            error = 0.0
+            for group in range(4):
+                inside = groups == group
+                model = linear.Ridge(alpha=penalty * (~inside).sum(), fit_intercept=False)
+                model.fit(x[~inside], y[~inside, target])
+                error += ((model.predict(x[inside]) - y[inside, target]) ** 2).sum()
+            errors.append(error)
+        best = penalties[int(np.argmin(errors))]
+        expected = linear.Ridge(alpha=best * len(x), fit_intercept=False).fit(x, y[:, target])
+        found = held_out_ridge(x, y[:, target : target + 1], groups, penalties)[:, 0]
+        assert found == pytest.approx(expected.coef_, rel=1e-9)
+
+
+def test_weights_are_zero_where_nothing_can_be_predicted():
+    random = np.random.default_rng(3)
+    x = random.standard_normal((40, 30))
+    y = random.standard_normal((40, 1))
+    groups = np.repeat(np.arange(4), 10)
+    assert not held_out_ridge(x, y, groups, (1e-6, 1e-3)).any()
+    assert not held_out_ridge(x, y, np.zeros(40, dtype=int)).any()
+
+
+# --- folds ----------------------------------------------------------------------------------------
+
+
+def test_windows_of_a_source_are_in_one_fold():
+    data = second_order(12, seed=0)
+    tasks = draw_tasks(data, TaskConfig(horizon_s=0.05, gap_s=GAP, window_s=0.2), 100)
+    fold = folds_of(tasks, 4)
+    source = np.array([note[1] for note in tasks.meta["tasks"]])
+    assert all(len(set(fold[source == s])) == 1 for s in np.unique(source))
+    assert np.bincount(fold, minlength=4).min() > 10
+
+
+def test_folds_of_one_source_are_blocks_of_time():
+    data = second_order(1, seed=0)
+    tasks = draw_tasks(data, TaskConfig(horizon_s=0.05, gap_s=GAP, window_s=0.2), 40)
+    fold = folds_of(tasks, 4)
+    first = np.array([note[2] for note in tasks.meta["tasks"]])
+    assert np.bincount(fold).tolist() == [10] * 4
+    assert all(first[fold == k].max() <= first[fold == k + 1].min() for k in range(3))
+
+
+def test_cross_fitted_predictions_are_those_of_a_fit_without_the_source():
+    data = second_order(12, seed=0)
+    tasks = draw_tasks(data, TaskConfig(horizon_s=0.05, gap_s=GAP, window_s=0.2), 60)
+    fold = folds_of(tasks, 3)
+    found = cross_fitted("ridge", tasks, 3)
+    for k in range(3):
+        others = fit_baseline("ridge", take_tasks(tasks, np.flatnonzero(fold != k)))
+        for i in np.flatnonzero(fold == k):
+            assert found[i] == pytest.approx(others.predict(tasks[i : i + 1])[0])
