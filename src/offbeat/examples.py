@@ -20,7 +20,7 @@ from offbeat.data.batch import Batch
 from offbeat.data.tasks import draw_tasks
 from offbeat.data.trajectory import Dataset
 from offbeat.metrics import Scores, ScoreSums
-from offbeat.models.base import BaseModel
+from offbeat.models.base import BaseModel, of_channels
 from offbeat.parts.heads import Prediction
 
 REFERENCE_TASKS = 600
@@ -40,13 +40,10 @@ def ordered(model: BaseModel, dataset: Dataset) -> Dataset:
     """A data set with the channels in the order of a model, and its input transforms applied.
 
     Args:
-        model: of the same channels; others are refused where a batch is made.
+        model: of the same channels.
         dataset: to train, validate or fit on.
     """
-    dataset = dataset.without_actions_but(model.names)
-    if dataset.names != model.names and set(dataset.names) == set(model.names):
-        dataset = dataset.select(model.names)
-    return model.transforms.apply(dataset)
+    return model.transforms.apply(of_channels(dataset, model.names, model.units))
 
 
 @dataclass(frozen=True, eq=False)

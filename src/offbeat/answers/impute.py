@@ -27,8 +27,10 @@ from offbeat.answers.two_sided import (
 )
 from offbeat.config import TrainConfig
 from offbeat.data.rows import add_rows, times_at_rate
+from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.examples import VALIDATION_TASKS, ordered
 from offbeat.files import write_json
 from offbeat.models.base import BaseModel, of_channels
 from offbeat.models.checkpoint import load_model, save_model
@@ -173,29 +175,82 @@ def fit_two_sided(
         DivergenceError: as `fit`.
     """
     folder = Path(out) if out is not None else None
-    # Angles are unwrapped before the reversal, because wraps are detected from the past.
-    train, validation = (model.transforms.apply(part) for part in (train, validation))
-    ahead = fit(model, train, validation, config, out=folder, device=device, progress=progress)
+    shown = {"device": device, "progress": progress}
+    ahead = fit(model, train, validation, config, out=folder, **shown)  # type: ignore[arg-type]
+    back, backwards = fit_backward(
+        model,
+        train,
+        validation,
+        config,
+        out=folder / "backward" if folder is not None else None,
+        seed=seed,
+        **shown,  # type: ignore[arg-type]
+    )
+    masked = ordered(model, Dataset.of(validation))
+    if config is not None and config.tasks is not None:
+        masked = draw_tasks(masked, config.tasks, VALIDATION_TASKS, shares=TWO_SIDED, seed=seed)
+    pair = TwoSided(model, back, fit_rule(model, back, masked, seed=seed))
+    if folder is not None:
+        write_json(folder / RULE_FILE, pair.rule.to_dict())
+    return pair, ahead, backwards
+
+
+def fit_backward(
+    model: BaseModel,
+    train: Dataset,
+    validation: Dataset | None = None,
+    config: TrainConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    seed: int = 0,
+    device: str | None = None,
+    progress: bool = True,
+) -> tuple[BaseModel, FitResult]:
+    """Trains a model like another one, but on reversed trajectories.
+
+    With tasks, those are of the kinds that fills from both sides have (`TWO_SIDED`).
+
+    Args:
+        model: whose config, transforms and scaler the backward model has.
+        train: the training set, in the order of time.
+        validation: as of `fit`.
+        config: of the training.
+        out: as of `fit`.
+        seed: of the initial weights.
+        device: as of `fit`.
+        progress: show a progress bar.
+
+    Returns:
+        The backward model, and the log of its training.
+
+    Raises:
+        InputError: as `fit`.
+        DivergenceError: as `fit`.
+    """
+
+    def reversed_part(part: Dataset) -> Dataset:
+        # Angles are unwrapped before the reversal, because wraps are detected from the past.
+        return reversed_in_time(ordered(model, Dataset.of(part)))
+
+    if config is not None and config.tasks is not None:
+        config = replace(config, tasks=replace(config.tasks, shares=TWO_SIDED))
     kind, options = (
         (model.config, {})
         if isinstance(model, Model)
         else (model.name, getattr(model, "options", {}))
     )
-    back = make_model(kind, reversed_in_time(train), scaler=model.scaler, seed=seed, **options)
+    back = make_model(kind, reversed_part(train), scaler=model.scaler, seed=seed, **options)
     back.to(model.dtype)
-    backwards = fit(
+    result = fit(
         back,
-        reversed_in_time(train),
-        reversed_in_time(validation),
+        reversed_part(train),
+        None if validation is None else reversed_part(validation),
         config,
-        out=folder / "backward" if folder is not None else None,
+        out=out,
         device=device,
         progress=progress,
     )
-    pair = TwoSided(model, back, fit_rule(model, back, validation, seed=seed))
-    if folder is not None:
-        write_json(folder / RULE_FILE, pair.rule.to_dict())
-    return pair, ahead, backwards
+    return back, result
 
 
 def save_two_sided(pair: TwoSided, path: str | Path) -> None:
