@@ -11,6 +11,7 @@ import offbeat as ob
 from offbeat.answers.impute import fit_backward
 from offbeat.baselines import AgeBins, LastValue, fit_baseline
 from offbeat.baselines.errors import ErrorTable, cells
+from offbeat.baselines.stack import fit_stack
 from offbeat.config import TaskConfig
 from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.examples import (
@@ -21,6 +22,7 @@ from offbeat.examples import (
     reference_tasks,
     relative_loss,
 )
+from offbeat.models.corrected import CorrectedModel
 from offbeat.models.zoo import recipe_of
 
 TASKS = TaskConfig(horizon_s=0.5, gap_s=0.05, window_s=2.0)
@@ -308,40 +310,87 @@ def test_a_pair_is_trained_on_tasks_and_the_backward_model_on_fills_from_both_si
 # --- corrections ------------------------------------------------------------------------------
 
 
-def test_a_correction_starts_at_its_base_and_gets_better(tmp_path):
-    base = fit_baseline("last_value", TRAIN)
-    model = ob.make_model("gru", TRAIN, hidden_size=16, decoder_units=(16,))
+def corrected(base: str, data: ob.Dataset = TRAIN, **options) -> CorrectedModel:
+    inner = ob.make_model(options.pop("name", "gru"), data, **{**SMALL, **options})
+    tasks = draw_tasks(data, TASKS, 100, seed=9)
+    return CorrectedModel.of(inner, fit_baseline(base, tasks), tasks)
+
+
+@pytest.mark.parametrize("name", ["gru", "ode_gru_d"])
+@pytest.mark.parametrize("base", ["last_value", "damped_slope", "kalman_short"])
+def test_a_model_that_corrects_a_baseline_starts_as_the_baseline(base, name):
+    model = corrected(base, name=name)
+    tasks = draw_tasks(VALIDATION, TASKS, 12, seed=7)
+    expected = model.base.predict(tasks)
+    for ours, theirs in zip(ob.predict(model, tasks), expected, strict=True):
+        np.testing.assert_allclose(ours.values, theirs, atol=1e-5)
+
+
+def test_a_corrected_baseline_gets_better_is_saved_and_resumed(tmp_path):
+    tasks = draw_tasks(VALIDATION, TASKS, 30, seed=7)
     config = ob.TrainConfig(tasks=TASKS, epochs=8, tasks_per_epoch=256, learning_rate=0.01)
-    task = draw_tasks(VALIDATION, TASKS, 30, seed=7)
-    frozen = replace(config, epochs=1, tasks_per_epoch=1, learning_rate=1e-30)
-    start = ob.fit(ob.make_model("gru", TRAIN, **SMALL), TRAIN, config=frozen, base=base,
-                   progress=False)  # fmt: skip
-    untrained = ob.make_model("gru", TRAIN, **SMALL)
-    for tensor in untrained.head.layers[-1] if untrained.head.layers else ():
-        torch.nn.init.zeros_(tensor)
-    for ours, theirs in zip(
-        start.correction.predict(untrained, task), base.predict(task), strict=True
-    ):
-        np.testing.assert_allclose(ours, theirs, atol=1e-6)
-    result = ob.fit(model, TRAIN, VALIDATION, config, base=base, out=tmp_path, progress=False)
-    errors = {}
-    for name, found in {
-        "base": base.predict(task),
-        "corrected": result.correction.predict(model, task),
-    }.items():
-        errors[name] = np.mean(
-            [np.nanmean((p - t.values)[1:, :2] ** 2) for p, t in zip(found, task, strict=True)]
-        )
-    assert errors["corrected"] < 0.7 * errors["base"]
-    with pytest.raises(ob.InputError, match="the predictor that is corrected differ"):
-        ob.fit(ob.make_model("gru", TRAIN, hidden_size=16, decoder_units=(16,)), TRAIN, VALIDATION,
-               config, base=fit_baseline("mean", TRAIN), out=tmp_path, progress=False)  # fmt: skip
+    options = {"hidden_size": 16, "decoder_units": (16,)}
+    model = corrected("last_value", **options)
+
+    def error() -> float:
+        """Of the two channels that are not noise."""
+        found = ob.evaluate({"model": model}, tasks).scores["model"].after_first_observation
+        return sum(found.per_channel[:2])
+
+    start = error()
+    ob.fit(model, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
+    assert error() < 0.5 * start
+    loaded = ob.load_model(tmp_path)
+    assert isinstance(loaded, CorrectedModel)
+    assert loaded.options == model.options
+    for a, b in zip(ob.predict(model, tasks), ob.predict(loaded, tasks), strict=True):
+        assert np.array_equal(a.values, b.values)
+    again = corrected("last_value", **options)
+    ob.fit(again, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
+    assert same(weights(again), weights(model))
+    other = corrected("damped_slope", **options)
+    with pytest.raises(ob.InputError, match="holds another run"):
+        ob.fit(other, TRAIN, VALIDATION, config, out=tmp_path, progress=False)
 
 
-def test_an_anchored_model_cannot_correct_a_base():
-    model = ob.make_model("anchored_ode_gru_d", TRAIN, **SMALL)
-    with pytest.raises(ob.InputError, match="cannot correct a base"):
-        ob.fit(model, TRAIN, base=fit_baseline("last_value", TRAIN), progress=False)
+def test_a_stack_of_baselines_can_be_corrected_and_saved(tmp_path):
+    parts = [draw_tasks(data, TASKS, 60, seed=3) for data in (TRAIN, VALIDATION)]
+    stack, _, _ = fit_stack(("last_value", "damped_slope"), *parts, span_s=50.0, gap_s=0.05)
+    model = CorrectedModel.of(ob.make_model("gru", TRAIN, **SMALL), stack, parts[0])
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.normal_(generator=torch.Generator().manual_seed(1))
+    model.save(tmp_path / "model")
+    loaded = ob.load_model(tmp_path / "model")
+    for a, b in zip(ob.predict(model, parts[1]), ob.predict(loaded, parts[1]), strict=True):
+        assert np.array_equal(a.values, b.values)
+
+
+def test_a_requested_time_changes_no_other_prediction_of_a_corrected_baseline():
+    model = corrected("damped_slope", name="gru")
+    with torch.no_grad():
+        for parameter in model.inner.parameters():
+            parameter.add_(0.1)
+    data = ob.Dataset((VALIDATION[0],))
+    end = float(data[0].times[-1])
+    few = ob.predict(model, data, times=[end + 0.5])[0].values
+    many = ob.predict(model, data, times=[end + 0.2, end + 0.5])[0].values
+    np.testing.assert_allclose(few[0], many[1], atol=1e-6)
+    assert not np.allclose(many[0], many[1])
+
+
+def test_a_backward_model_corrects_the_same_baseline_fitted_to_reversed_tasks():
+    model = corrected("damped_slope")
+    config = ob.TrainConfig(tasks=TASKS, epochs=1, tasks_per_epoch=16)
+    back, _ = fit_backward(model, TRAIN, VALIDATION, config, progress=False)
+    assert isinstance(back, CorrectedModel)
+    assert back.inner.config == model.inner.config
+    assert not np.array_equal(back.base.factor, model.base.factor)
+
+
+def test_an_anchored_model_cannot_correct_a_baseline():
+    with pytest.raises(ob.InputError, match="cannot correct a baseline"):
+        corrected("last_value", name="anchored_ode_gru_d")
 
 
 def test_cells_are_the_bins_that_baselines_use():

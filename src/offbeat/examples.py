@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from offbeat.baselines import AgeBins, Baseline, causal_baselines, fit_baseline
+from offbeat.baselines import AgeBins, Baseline, fit_baseline
 from offbeat.baselines.errors import CLIPPED, ErrorTable, cells
 from offbeat.config import Recipe
-from offbeat.correction import Base, Correction, corrected, scaled
 from offbeat.data.batch import Batch
 from offbeat.data.tasks import draw_tasks
 from offbeat.data.trajectory import Dataset
@@ -31,6 +31,9 @@ VALIDATION_TASKS = 300
 
 HUBER = 3.0
 """Errors beyond this multiple of the typical one count linearly in the relative loss."""
+
+UNITS = ("last_value", "mean", "running_mean", "constant_velocity", "damped_slope")
+"""Baselines whose errors are the units of the relative loss, where no others are given."""
 
 # Streams of random numbers; those of the epochs are (seed, _EPOCHS, epoch).
 _FITTED, _MEASURED, _VALIDATED, _EPOCHS = range(4)
@@ -57,7 +60,7 @@ class Reference:
         weights: (bins + 1, channels) of errors in the loss.
     """
 
-    baselines: tuple[Base, ...]
+    baselines: tuple[Baseline, ...]
     errors: ErrorTable
     typical: Tensor
     weights: Tensor
@@ -68,7 +71,7 @@ class Reference:
         return self.errors.bins
 
     @classmethod
-    def of(cls, baselines: Sequence[Base], model: BaseModel, tasks: Dataset) -> Reference:
+    def of(cls, baselines: Sequence[Baseline], model: BaseModel, tasks: Dataset) -> Reference:
         """Measures fitted baselines.
 
         Args:
@@ -86,8 +89,8 @@ class Reference:
 
 
 def fitted_baselines(tasks: Dataset) -> tuple[Baseline, ...]:
-    """All causal baselines, fitted to tasks."""
-    return tuple(fit_baseline(name, tasks) for name in causal_baselines())
+    """The baselines of `UNITS`, fitted to tasks."""
+    return tuple(fit_baseline(name, tasks) for name in UNITS)
 
 
 def reference_tasks(train: Dataset, recipe: Recipe) -> tuple[Dataset, Dataset]:
@@ -106,6 +109,24 @@ def reference_tasks(train: Dataset, recipe: Recipe) -> tuple[Dataset, Dataset]:
     return fitted, measured
 
 
+def scaled(baseline: Baseline, model: BaseModel, dataset: Dataset, batch: Batch) -> Tensor:
+    """The predictions of a baseline in the scaled units of a model.
+
+    Args:
+        baseline: fitted.
+        model: whose scaler is used.
+        dataset: `ordered`.
+        batch: of the same trajectories.
+
+    Returns:
+        (batch, rows, channels), 0 in padding.
+    """
+    values = np.zeros(batch.values.shape)
+    for row, predicted in zip(values, baseline.predict(dataset), strict=True):
+        row[: len(predicted)] = model.scaler.scaled(predicted)
+    return torch.from_numpy(values).to(batch.values)
+
+
 class Examples:
     """Trajectories in memory, with inputs that are computed once.
 
@@ -113,16 +134,10 @@ class Examples:
         model: its scales and statistics give the step inputs.
         batch: scaled.
         reference: of the relative loss; None for that of the model's head.
-        terms: (batch, rows, channels) base and scale, where the model corrects a base.
     """
 
     def __init__(
-        self,
-        model: BaseModel,
-        batch: Batch,
-        *,
-        reference: Reference | None = None,
-        terms: tuple[Tensor, Tensor] | None = None,
+        self, model: BaseModel, batch: Batch, *, reference: Reference | None = None
     ) -> None:
         with torch.no_grad():
             self.prepared = model.prepare(batch)
@@ -130,7 +145,6 @@ class Examples:
         self.targets = batch.values[:, 1:].contiguous()
         counted = batch.targets[:, 1:]
         self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
-        self.terms = None if terms is None else tuple(term[:, 1:].contiguous() for term in terms)
         self.typical = None
         if reference is not None:
             at = cells(batch, reference.bins)[:, 1:]
@@ -160,9 +174,6 @@ class Examples:
             mask = self.counted.index_select(0, index)[:, :rows]
         elif not rows:
             mask = torch.ones_like(targets)
-        if self.terms is not None:
-            base, unit = (term.index_select(0, index)[:, :rows] for term in self.terms)
-            prediction = corrected(prediction, base, unit)
         if self.typical is None or prediction.scale is not None:
             return model.loss(prediction, targets, mask)
         typical = self.typical.index_select(0, index)[:, :rows]
@@ -197,7 +208,6 @@ class TrainingSet:
         train: the training set, `ordered`.
         recipe: with the tasks and the seed.
         reference: of the relative loss; None for that of the model's head.
-        correction: of a base by the model, or None.
     """
 
     def __init__(
@@ -207,10 +217,9 @@ class TrainingSet:
         recipe: Recipe,
         *,
         reference: Reference | None = None,
-        correction: Correction | None = None,
     ) -> None:
         self._model, self._train, self._recipe = model, train, recipe
-        self._reference, self._correction = reference, correction
+        self._reference = reference
         self._next: tuple[int, Future[Examples]] | None = None
         self._same = None if recipe.tasks is not None else self._examples(train)
         self._drawer = ThreadPoolExecutor(1) if recipe.tasks is not None else None
@@ -249,10 +258,7 @@ class TrainingSet:
         )
 
     def _examples(self, tasks: Dataset) -> Examples:
-        batch, terms = self._model.batch(tasks), None
-        if self._correction is not None:
-            terms = self._correction.terms(self._model, tasks, batch)
-        return Examples(self._model, batch, reference=self._reference, terms=terms)
+        return Examples(self._model, self._model.batch(tasks), reference=self._reference)
 
 
 @dataclass(frozen=True)
@@ -276,7 +282,6 @@ class ValidationSet:
         model: its scales and statistics give the step inputs.
         batch: scaled by the model's scaler.
         size: trajectories at a time.
-        terms: (batch, rows, channels) base and scale, where the model corrects a base.
     """
 
     def __init__(
@@ -306,7 +311,6 @@ class ValidationSet:
         recipe: Recipe,
         *,
         reference: Reference | None = None,
-        correction: Correction | None = None,
     ) -> ValidationSet:
         """The validation set of a training: trajectories as they are, or tasks drawn once.
 
@@ -315,15 +319,13 @@ class ValidationSet:
             validation: trajectories, `ordered`.
             recipe: with the tasks and the seed.
             reference: of the relative score; None for none.
-            correction: of a base by the model, or None.
         """
         tasks = validation
         if recipe.tasks is not None:
             seed = [recipe.seed, _VALIDATED]
             tasks = draw_tasks(validation, recipe.tasks, VALIDATION_TASKS, seed=seed)
         batch = model.batch(tasks)
-        terms = None if correction is None else correction.terms(model, tasks, batch)
-        found = cls(model, batch, terms=terms)
+        found = cls(model, batch)
         if reference is not None:
             best = ErrorTable.best(
                 ErrorTable.of(scaled(each, model, tasks, batch), batch, reference.bins)
@@ -366,14 +368,10 @@ class ValidationSet:
         sums = ScoreSums(self.channels, gap_unit=gap_unit)
         means = []
         with torch.inference_mode():
-            for i, (prepared, part) in enumerate(self.parts):
+            for prepared, part in self.parts:
                 # One generator for all parts, as if they were one batch.
                 generator = torch.Generator().manual_seed(seed) if model.needs_generator else None
                 found: Prediction = model.run(prepared, generator=generator)
-                if self._terms is not None:
-                    at = slice(i * self._size, i * self._size + len(part))
-                    base, unit = (term[at, : part.rows] for term in self._terms)
-                    found = corrected(found, base, unit)
                 sums.add(found.mean, part)
                 means.append(found.mean)
         return sums.scores(), means
@@ -394,22 +392,3 @@ def validate(model: BaseModel, batch: Batch, *, seed: int = 0, size: int = 500) 
     """
     validated = ValidationSet(model, batch, size=size)
     return validated.scores(model, seed=seed, gap_unit=model.statistics.median_gap)
-
-
-def expect_silences(model: BaseModel, seconds: float) -> None:
-    """Lets a model know of silences that its training will have.
-
-    Its clock saturates at a multiple of the longest time since observation that was measured when
-    it was made, which tasks can exceed.
-
-    Args:
-        model: changed in place.
-        seconds: longest time since the last observation in the tasks.
-    """
-    known = model.statistics
-    model.statistics = replace(
-        known,
-        longest_elapsed=max(known.longest_elapsed, seconds),
-        longest_delta=max(known.longest_delta, seconds),
-    )
-    model.data = replace(model.data, statistics=model.statistics)

@@ -25,6 +25,7 @@ from offbeat.errors import InputError
 from offbeat.files import write_text
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_training_state, save_training_state
+from offbeat.models.corrected import CorrectedModel
 from offbeat.models.foreign import ForeignModel
 from offbeat.models.model import Model
 
@@ -183,7 +184,7 @@ def identity_of(
     recipe: Recipe,
     train: Dataset,
     validation: Dataset | None,
-    **others: Sequence[Any],
+    baselines: Sequence[Any] | None = None,
 ) -> dict[str, Any]:
     """The identity of a run, which must be equal to resume it.
 
@@ -192,7 +193,7 @@ def identity_of(
         recipe: of the training.
         train: the training set.
         validation: the validation set, or None.
-        **others: predictors that the training was given: a base, or baselines.
+        baselines: that the training was given.
     """
     weights = hashlib.sha256()
     for value in model.state_dict().values():
@@ -200,10 +201,10 @@ def identity_of(
     options: dict[str, Any] = {}
     if isinstance(model, Model):
         options = asdict(model.config)
-    elif isinstance(model, ForeignModel):
+    elif isinstance(model, ForeignModel | CorrectedModel):
         options = model.options
     identity: dict[str, Any] = {
-        "model": {"name": model.name, **options},
+        "model": {**options, "name": model.name},
         "training": asdict(recipe),
         "train": _part(train),
         "validation": None if validation is None else _part(validation),
@@ -219,8 +220,8 @@ def identity_of(
             identity["training"].pop(name)
     if recipe.loss == "head":
         identity["training"].pop("loss")
-    for name, predictors in others.items():
-        identity[name] = [_predictor(each) for each in predictors]
+    if baselines is not None:
+        identity["baselines"] = [_predictor(each) for each in baselines]
     # lists in place of tuples, as in the file
     plain: dict[str, Any] = json.loads(json.dumps(identity))
     return plain
@@ -253,7 +254,6 @@ _WORDS = {
     "initial_weights": "the initial weights",
     "train": "the trajectories of the training set",
     "validation": "the trajectories of the validation set",
-    "base": "the predictor that is corrected",
     "baselines": "the baselines",
 }
 """Names of the parts of an identity in messages."""

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from offbeat.baselines import AgeBins
+from offbeat.baselines import Baseline
 from offbeat.config import Recipe, TrainConfig
-from offbeat.correction import Base, Correction, start_at_base
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
 from offbeat.examples import (
@@ -25,7 +24,6 @@ from offbeat.examples import (
     Reference,
     TrainingSet,
     ValidationSet,
-    expect_silences,
     fitted_baselines,
     ordered,
     reference_tasks,
@@ -62,7 +60,6 @@ class FitResult:
         folder: of log and checkpoints, or None.
         recipe: training configuration that was used.
         best_epoch: of the lowest validation error; 0 if none was better than any other.
-        correction: the base that the model corrects, and its scale; None without a base.
         diverged: what happened, where the training diverged and ended with its best weights; else
             empty.
     """
@@ -72,7 +69,6 @@ class FitResult:
     folder: Path | None
     recipe: Recipe
     best_epoch: int = 0
-    correction: Correction | None = None
     diverged: str = ""
 
     @property
@@ -94,8 +90,7 @@ def fit(
     config: TrainConfig | None = None,
     *,
     out: str | Path | None = None,
-    base: Base | None = None,
-    baselines: Sequence[Base] | None = None,
+    baselines: Sequence[Baseline] | None = None,
     device: str | torch.device | None = None,
     callbacks: Sequence[Callback] = (),
     progress: bool = True,
@@ -119,10 +114,8 @@ def fit(
         config: fields that are None, or all of them if it is None, follow the model's recipe.
         out: folder for `log.csv`, checkpoints and the final `model`; a run that was stopped there
             is resumed, and ends bit for bit as if it had not been stopped.
-        base: a predictor, such as a fitted causal baseline; the model is then trained to correct
-            it, and `FitResult.correction` predicts with both.
-        baselines: fitted to training data; the best of their errors are the units of the relative
-            loss and score. By default all causal ones are fitted to tasks.
+        baselines: causal ones, fitted to training data; the best of their errors are the units of
+            the relative loss and score. By default those of `examples.UNITS` are fitted to tasks.
         device: such as `cpu` or `cuda`; by default that of the model. The model stays on it.
         callbacks: each is called with the record of an epoch and the model after that epoch; a true
             result stops the training.
@@ -133,8 +126,7 @@ def fit(
 
     Raises:
         InputError: data of other channels than the model, no validation set although `patience` or
-            `keep="best"` needs one, a model that cannot correct a base, or `out` holds another run
-            or is used by one.
+            `keep="best"` needs one, or `out` holds another run or is used by one.
         DivergenceError: the loss is no longer finite and no best weights are kept; the last good
             checkpoint is.
     """
@@ -147,21 +139,18 @@ def fit(
     if device is not None:
         model.to(_device(device))
     if asked.tasks is not None:
-        expect_silences(model, asked.tasks.horizon_s)
-    if base is not None:
-        start_at_base(model)
+        model.expect_silences(asked.tasks.horizon_s)
     trained_on = ordered(model, train)
     recipe = recipe_of(model.name, asked, validated=validation is not None)
-    reference, correction = _predictors(model, trained_on, recipe, base, baselines)
+    reference = None
+    if recipe.relative:
+        fitted_to, measured_on = reference_tasks(trained_on, recipe)
+        known = fitted_baselines(fitted_to) if baselines is None else baselines
+        reference = Reference.of(known, model, measured_on)
     validated = None
     if validation is not None:
-        validated = ValidationSet.of(
-            model,
-            ordered(model, validation),
-            recipe,
-            reference=reference,
-            correction=correction,
-        )
+        own = ordered(model, validation)
+        validated = ValidationSet.of(model, own, recipe, reference=reference)
     counts = validated is not None and validated.counted > 0
     recipe = recipe_of(model.name, asked, validated=counts)
     if not counts and (recipe.patience is not None or recipe.keep == "best"):
@@ -181,7 +170,6 @@ def fit(
                     trained_on,
                     recipe,
                     reference=reference if recipe.loss == "relative" else None,
-                    correction=correction,
                 )
             )
         )
@@ -190,9 +178,7 @@ def fit(
         state = RunState(parameters, recipe)
         identity: dict[str, Any] = {}
         if folder is not None:
-            others = {"base": [base] if base is not None else [], "baselines": baselines or []}
-            given = {name: each for name, each in others.items() if each}
-            identity = identity_of(model, recipe, train, validation, **given)
+            identity = identity_of(model, recipe, train, validation, baselines)
             resume_run(folder, model, state, identity)
             if state.epoch > recipe.epochs:
                 raise InputError(
@@ -200,29 +186,7 @@ def fit(
                     "requested; give another folder"
                 )
         run = (recipe, state, folder, identity, callbacks, progress)
-        result = _fit(model, examples, validated, *run)
-    return replace(result, correction=correction)
-
-
-def _predictors(
-    model: BaseModel,
-    train: Dataset,
-    recipe: Recipe,
-    base: Base | None,
-    baselines: Sequence[Base] | None,
-) -> tuple[Reference | None, Correction | None]:
-    """The baselines that errors are compared with, and the base that is corrected."""
-    if base is None and not recipe.relative:
-        return None, None
-    fitted_to, measured_on = reference_tasks(train, recipe)
-    correction = None
-    if base is not None:
-        correction = Correction.of(base, model, measured_on, AgeBins.of(measured_on))
-    reference = None
-    if recipe.relative:
-        given = fitted_baselines(fitted_to) if baselines is None else baselines
-        reference = Reference.of(given, model, measured_on)
-    return reference, correction
+        return _fit(model, examples, validated, *run)
 
 
 def _device(name: str | torch.device) -> torch.device:

@@ -30,12 +30,13 @@ from offbeat.data.rows import add_rows, times_at_rate
 from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
-from offbeat.examples import VALIDATION_TASKS, ordered
+from offbeat.examples import VALIDATION_TASKS, ordered, reference_tasks
 from offbeat.files import write_json
 from offbeat.models.base import BaseModel, of_channels
 from offbeat.models.checkpoint import load_model, save_model
+from offbeat.models.corrected import CorrectedModel, refitted
 from offbeat.models.model import Model
-from offbeat.models.zoo import make_model
+from offbeat.models.zoo import make_model, recipe_of
 from offbeat.training import FitResult, fit
 
 MODES = ("causal", "two_sided")
@@ -234,16 +235,21 @@ def fit_backward(
 
     if config is not None and config.tasks is not None:
         config = replace(config, tasks=replace(config.tasks, shares=TWO_SIDED))
+    turned = reversed_part(train)
+    inner = model.inner if isinstance(model, CorrectedModel) else model
     kind, options = (
-        (model.config, {})
-        if isinstance(model, Model)
-        else (model.name, getattr(model, "options", {}))
+        (inner.config, {})
+        if isinstance(inner, Model)
+        else (inner.name, getattr(inner, "options", {}))
     )
-    back = make_model(kind, reversed_part(train), scaler=model.scaler, seed=seed, **options)
+    back: BaseModel = make_model(kind, turned, scaler=model.scaler, seed=seed, **options)
     back.to(model.dtype)
+    if isinstance(model, CorrectedModel) and isinstance(back, Model):
+        tasks, others = reference_tasks(turned, recipe_of(model.name, config, validated=False))
+        back = CorrectedModel.of(back, refitted(model.base, tasks), others)
     result = fit(
         back,
-        reversed_part(train),
+        turned,
         None if validation is None else reversed_part(validation),
         config,
         out=out,

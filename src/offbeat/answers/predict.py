@@ -16,6 +16,7 @@ from offbeat.data.rows import add_rows
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
 from offbeat.models.base import BaseModel, of_channels
+from offbeat.models.corrected import CorrectedModel
 from offbeat.models.model import Model
 
 Times = ArrayLike | Sequence[ArrayLike]
@@ -171,6 +172,8 @@ def check_any_time(model: BaseModel | Blend) -> None:
         InputError: it would change one.
     """
     model = model.forward if isinstance(model, Blend) else model  # type: ignore[assignment]
+    if isinstance(model, CorrectedModel):
+        model = model.inner
     if not isinstance(model, Model):
         return
     for field, value, meaning in (

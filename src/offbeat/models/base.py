@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sized
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -100,6 +100,22 @@ class BaseModel(nn.Module):
     def needs_generator(self) -> bool:
         """Whether a prediction draws random numbers."""
         return False
+
+    def expect_silences(self, seconds: float) -> None:
+        """Lets the model know of longer silences than those in the data that it was made for.
+
+        The clock of a model saturates at a multiple of the longest time since observation.
+
+        Args:
+            seconds: longest time since observation that it is going to meet in training.
+        """
+        known = self.statistics
+        self.statistics = replace(
+            known,
+            longest_elapsed=max(known.longest_elapsed, seconds),
+            longest_delta=max(known.longest_delta, seconds),
+        )
+        self.data = replace(self.data, statistics=self.statistics)
 
     def batch(self, dataset: Dataset) -> Batch:
         """Transforms, scales and pads a data set of this model's channels, in any order.

@@ -19,6 +19,7 @@ from offbeat.data.transforms import Transforms
 from offbeat.errors import FileFormatError, InputError
 from offbeat.files import atomic_folder
 from offbeat.models.base import BaseModel, DataInfo
+from offbeat.models.corrected import CorrectedModel
 from offbeat.models.foreign import ForeignModel
 from offbeat.models.model import Model
 from offbeat.models.statistics import Statistics
@@ -48,7 +49,7 @@ def load_model(path: str | Path) -> Any:
             that `fit` wrote.
 
     Returns:
-        A `Model`, or a `ForeignModel`.
+        A `Model`, a `CorrectedModel`, or a `ForeignModel`.
 
     Raises:
         FileFormatError: the folder is missing, damaged, not a checkpoint,
@@ -116,7 +117,7 @@ def _record(model: BaseModel) -> dict[str, Any]:
     config: dict[str, Any] = {}
     if isinstance(model, Model):
         config = asdict(model.config)
-    elif isinstance(model, ForeignModel):
+    elif isinstance(model, ForeignModel | CorrectedModel):
         config = model.options
     return {
         "format": FORMAT,
@@ -143,6 +144,8 @@ def _build(record: dict[str, Any]) -> BaseModel:
         statistics=Statistics.from_dict(record["statistics"]),
         transforms=Transforms.from_dict(record["transforms"]),
     )
+    if "inner" in record["model"]:
+        return CorrectedModel.restored(record["model"]["inner"], record["model"]["base"], data)
     return build(record["name"], record["model"], data)
 
 

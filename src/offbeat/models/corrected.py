@@ -1,0 +1,271 @@
+"""Models that correct a baseline: prediction = base + scale * output of the model.
+
+The base is a causal baseline in closed form, the scale its typical error for the channel and the
+time since its last observation. So the model's output is a number of about 1 for any channel and
+any time, and where it is 0 the prediction is that of the base: training starts there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from offbeat.baselines.base import BASELINES, CausalBaseline, Rows, stepped
+from offbeat.baselines.errors import CLIPPED, ErrorTable, cells
+from offbeat.baselines.history import AgeBins
+from offbeat.baselines.stack import Stack
+from offbeat.config import ModelConfig, from_mapping
+from offbeat.data.batch import Batch
+from offbeat.data.trajectory import Dataset
+from offbeat.errors import InputError
+from offbeat.models.base import BaseModel, DataInfo
+from offbeat.models.model import Model
+from offbeat.parts.heads import Prediction
+
+STACK = "stack"
+"""Name of a weighted mean of baselines, which is made of registered ones."""
+
+_CHUNK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedInputs:
+    """A data set in the form that `CorrectedModel.run` takes.
+
+    Attributes:
+        inner: the same of the inner model.
+        base: (batch, rows, channels) predictions of the base, scaled units.
+        scale: (batch, rows, channels) of the inner model's output, scaled units.
+    """
+
+    inner: Any
+    base: Tensor
+    scale: Tensor
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+    def take(self, index: Tensor) -> CorrectedInputs:
+        """Some trajectories, trimmed to the longest of them.
+
+        Args:
+            index: (batch,) positions, int64.
+        """
+        inner, index = self.inner.take(index), index.to(self.base.device)
+        base, scale = (of[:, : inner.rows].index_select(0, index) for of in (self.base, self.scale))
+        return CorrectedInputs(inner, base, scale)
+
+
+class CorrectedModel(BaseModel):
+    """A model of parts that corrects a fitted causal baseline.
+
+    Args:
+        inner: not anchored; its output is the correction.
+        base: fitted to data of the same channels, with the model's transforms applied.
+        bins: of times since observation.
+        scale: (bins + 1, channels) unit of the output, in scaled units; its last row is for
+            predictions before the first observation of a channel.
+    """
+
+    scale: Tensor
+
+    def __init__(self, inner: Model, base: CausalBaseline, bins: AgeBins, scale: Tensor) -> None:
+        super().__init__(f"{inner.name}_on_{name_of(base)}", inner.data)
+        self.inner, self.base, self.bins = inner, base, bins
+        self.register_buffer("scale", scale)
+        # Saved with the weights; the base itself works on arrays.
+        for name, array in self._arrays().items():
+            self.register_buffer(_buffer(name), torch.from_numpy(np.array(array)))
+
+    @classmethod
+    def of(cls, inner: Model, base: CausalBaseline, tasks: Dataset) -> CorrectedModel:
+        """Makes an untrained model, which predicts what the base does.
+
+        Args:
+            inner: untrained; the last layer of its decoder is set to 0.
+            base: fitted to tasks.
+            tasks: that give the scale; of a base that fits its own tasks closely, other ones.
+
+        Raises:
+            InputError: the inner model has no decoder of its own, as an anchored one.
+        """
+        _start_at_zero(inner)
+        batch, bins = inner.batch(tasks), AgeBins.of(tasks)
+        shape = (len(bins) + 1, inner.channels)
+        found = cls(inner, base, bins, torch.ones(shape, dtype=inner.dtype))
+        table = ErrorTable.of(found.predicted_by_base(batch), batch, bins, clipped=CLIPPED)
+        found.scale.copy_(table.typical(inner.std.cpu()))
+        return found
+
+    @classmethod
+    def restored(
+        cls, inner: Mapping[str, Any], base: Mapping[str, Any], data: DataInfo
+    ) -> CorrectedModel:
+        """Makes a model of the same parts as one that was saved; its weights are to be loaded.
+
+        Args:
+            inner: config of the inner model.
+            base: as in `options`.
+            data: properties of the data that it is made for.
+        """
+        kind = Stack if base["name"] == STACK else BASELINES[base["name"]]
+        arrays = {
+            name: np.zeros(shape, dtype=np.dtype(type_))
+            for name, (type_, shape) in base["arrays"].items()
+        }
+        edges = arrays.pop("bins")
+        made = kind().restore(arrays)
+        if not isinstance(made, CausalBaseline):
+            raise InputError(f"the baseline {base['name']!r} is not causal and cannot be corrected")
+        model = Model(from_mapping(ModelConfig, dict(inner)), data)
+        scale = torch.ones((len(edges) + 1, model.channels), dtype=model.dtype)
+        return cls(model, made, AgeBins(edges), scale)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """JSON-like description of the parts, saved with the model."""
+        arrays = {k: [str(v.dtype), list(v.shape)] for k, v in self._arrays().items()}
+        return {
+            "name": self.inner.name,
+            "inner": asdict(self.inner.config),
+            "base": {"name": name_of(self.base), "arrays": arrays},
+        }
+
+    def _arrays(self) -> dict[str, Any]:
+        arrays = {name: np.asarray(array) for name, array in self.base.arrays().items()}
+        return {**arrays, "bins": self.bins.edges}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
+        """Loads weights, and the base's arrays with them."""
+        found = super().load_state_dict(state_dict, *args, **options)
+        buffers = dict(self.named_buffers())
+        arrays = {name: buffers[_buffer(name)].cpu().numpy().copy() for name in self._arrays()}
+        self.bins = AgeBins(arrays.pop("bins"))
+        self.base.restore(arrays)
+        return found
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """That of the inner model."""
+        return self.inner.dtype
+
+    @property
+    def needs_generator(self) -> bool:
+        """Whether a prediction of the inner model draws random numbers."""
+        return self.inner.needs_generator
+
+    def expect_silences(self, seconds: float) -> None:
+        """See `BaseModel`."""
+        super().expect_silences(seconds)
+        self.inner.expect_silences(seconds)
+
+    def predicted_by_base(self, batch: Batch) -> Tensor:
+        """(batch, rows, channels) predictions of the base from earlier rows, in scaled units."""
+        parts = []
+        mask = batch.mask & batch.valid[..., None]
+        values = self.scaler.original(batch.values.double().cpu().numpy())
+        for first in range(0, len(batch), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            rows = Rows(
+                batch.times[part].cpu().numpy(),
+                values[part],
+                mask[part].cpu().numpy(),
+                batch.known[part].cpu().numpy(),
+                tuple(batch.valid[part].sum(dim=1).tolist()),
+            )
+            parts.append(self.scaler.scaled(stepped(self.base, rows)))
+        return torch.from_numpy(np.concatenate(parts)).to(batch.values)
+
+    def prepare(self, batch: Batch) -> CorrectedInputs:
+        """See `BaseModel`."""
+        at = cells(batch, self.bins)
+        scale = self.scale[at, torch.arange(self.channels, device=at.device)]
+        return CorrectedInputs(self.inner.prepare(batch), self.predicted_by_base(batch), scale)
+
+    def run(
+        self, prepared: CorrectedInputs, *, generator: torch.Generator | None = None
+    ) -> Prediction:
+        """See `BaseModel`."""
+        output = self.inner.run(prepared.inner, generator=generator)
+        spread = None if output.scale is None else prepared.scale * output.scale
+        return Prediction(prepared.base + prepared.scale * output.mean, spread)
+
+    def forward(self, batch: Batch, *, generator: torch.Generator | None = None) -> Prediction:
+        """Predicts every row of a batch from earlier observations.
+
+        Args:
+            batch: scaled.
+            generator: of random numbers, where the inner model draws any.
+        """
+        index = torch.arange(len(batch))
+        return self.run(self.prepare(batch).take(index), generator=generator)
+
+    def loss(self, prediction: Prediction, target: Tensor, mask: Tensor | None) -> Tensor:
+        """The loss of the inner model's head."""
+        return self.inner.loss(prediction, target, mask)
+
+    def backend(self) -> tuple[str, str]:
+        """That of the inner model."""
+        return self.inner.backend()
+
+    def threads(self) -> AbstractContextManager[None]:
+        """As of the inner model."""
+        return self.inner.threads()
+
+
+def name_of(base: CausalBaseline) -> str:
+    """The name of a baseline in the registry.
+
+    Raises:
+        InputError: it is not registered, so that a model with it could not be loaded.
+    """
+    if isinstance(base, Stack):
+        return STACK
+    for name, kind in BASELINES.items():
+        if type(base) is kind:
+            return name
+    raise InputError(
+        f"the baseline {type(base).__name__} is not registered; call "
+        "offbeat.baselines.BASELINES.register(name, kind) before a model corrects it"
+    )
+
+
+def refitted(base: CausalBaseline, tasks: Dataset) -> CausalBaseline:
+    """A baseline of the same kind, fitted to other data.
+
+    Args:
+        base: fitted.
+        tasks: of other data.
+
+    Raises:
+        InputError: it is a stack, which is fitted to training and validation data together.
+    """
+    if isinstance(base, Stack):
+        raise InputError("a stack of baselines is fitted by fit_stack; give another base")
+    other = type(base)().fit(tasks)
+    assert isinstance(other, CausalBaseline)
+    return other
+
+
+def _buffer(name: str) -> str:
+    """Name of a buffer, in which a module allows no dot."""
+    return "base/" + name.replace(".", "/")
+
+
+def _start_at_zero(inner: Model) -> None:
+    """Sets the last layer of the decoder to 0."""
+    decoder = None if inner.config.anchored else getattr(inner.head, "decoder", None)
+    if decoder is None:
+        raise InputError(
+            f"the model {inner.name!r} cannot correct a baseline: that takes a decoder whose last "
+            "layer starts at 0; give a model that is not anchored, such as gru or ode_gru_d"
+        )
+    with torch.no_grad():
+        for tensor in decoder.layers[-1]:
+            tensor.zero_()
