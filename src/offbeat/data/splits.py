@@ -156,9 +156,9 @@ def apply_split(dataset: Dataset, config: SplitConfig) -> tuple[Dataset, Dataset
     """Cuts windows, masks values and splits, all from one seed.
 
     By trajectory, all windows of a trajectory are in one part. By time and in blocks, the recording
-    is split first, so that no window spans two parts. Where each trajectory gives one window, values are
-    masked in the windows; where it gives several, they are masked before it is cut, so that the
-    fraction holds for the trajectory, or for its part in time. `random` windows are for training:
+    is split first, so that no window spans two parts. Where each trajectory gives one window,
+    values are masked in the windows; where it gives several, they are masked before it is cut, so
+    that the fraction holds for the trajectory, or for its piece. `random` windows are for training:
     validation and test are cut consecutively, so that each of their rows counts once.
 
     Args:
