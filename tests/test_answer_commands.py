@@ -68,7 +68,7 @@ def test_a_two_sided_run_holds_both_models_and_says_who_wins(run):
     assert "one step ahead" in results["verdict"]
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert config["two_sided"] is True
-    assert config["reader"] == {"time_column": "stamp", "time_unit": "ms"}
+    assert config["reader"] == {"time_column": "stamp", "time_unit": "ms", "outliers": "mask"}
 
 
 def test_the_saved_config_trains_the_same_pair_again(run, log, tmp_path):
@@ -253,7 +253,8 @@ def test_bad_input_is_one_clear_line(run, log, tmp_path, capsys):
         (["evaluate", run, log, "--mask=burst"], "did you mean 'bursts'"),
         (["evaluate", run, log, "--horizons=1000"], "horizons"),
         (["train", log, out.parent, *READER, "--split.mask=cell"], "mask"),
-        (["train", log, out.parent, *READER], "--split.by time"),
+        (["train", log, out.parent, *READER, "--split.window=20"], "--split.by time"),
+        (["train", log, out.parent, *READER, "--horizon_s=0"], "horizon_s"),
         (["predict", run, log, out, "--reader.delimiter=;;"], "delimiter"),
     ):
         assert message in one_line_error(capsys, *arguments)

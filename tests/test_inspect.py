@@ -14,6 +14,7 @@ import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.data.advice import advise
 from offbeat.data.inspection import inspect, without_repeats
+from offbeat.data.plan import plan, prepare
 from offbeat.data.readers import read
 from offbeat.data.recording import ReaderOptions, Recording, Signal, assemble
 
@@ -64,25 +65,35 @@ def test_every_anomaly_that_was_put_in_is_found(damaged):
     assert len(found.found) == 7, "one sentence for each"
 
 
-def test_the_advice_masks_repeats_and_keeps_a_quaternion_whole(damaged):
-    command = advise(read(damaged), "damaged.csv").command
-    assert "--reader.without=[broken]" in command
-    assert "--reader.repeated=mask" in command
-    # Model and training are those of the recipe, which nothing needs to repeat.
-    assert {word.partition(".")[0] for word in command[4:]} == {"--reader", "--split"}
+def test_the_plan_masks_repeats_and_keeps_a_quaternion_whole(damaged):
+    chosen = plan(read(damaged))
+    assert chosen.reader == {"outliers": "mask", "repeated": "mask", "angles": ["yaw"]}
+    assert chosen.redundant.empty == ("broken",)
+    assert not chosen.redundant.constants, "qx and qy are 0, and parts of a quaternion"
 
 
-def test_the_advice_holds_for_the_data_as_they_will_be_read():
+def test_the_advice_says_nothing_that_train_would_choose_itself(damaged):
+    reader = {"time_unit": "us", "without": ["broken", "a b"], "max_gap_s": None}
+    command = advise(read(damaged, time_unit="us"), "damaged.csv", "run", reader=reader).command
+    assert command == (
+        "offbeat", "train", "damaged.csv", "run", "--reader.time_unit=us",
+        '--reader.without=[broken, "a b"]', "--reader.max_gap_s=null",
+    )  # fmt: skip
+    assert advise(read(damaged), "damaged.csv").command[2:] == ("damaged.csv", "runs/log")
+
+
+def test_the_plan_holds_for_the_data_as_they_will_be_read():
     # A sensor of 20 Hz whose values a recording of 100 Hz repeats, beside one of 100 Hz.
     rows = np.arange(2000)
-    values = np.column_stack([np.sin(0.1 * rows), (rows // 5) % 11])
+    values = np.column_stack([np.sin(0.1 * rows), (rows // 5) * 7 % 11])
     (one,) = data = ob.Dataset((ob.Trajectory(rows / 100, values, names=("fast", "slow")),))
     assert inspect(data).channels[1].rate_hz == pytest.approx(100)
     masked = inspect(without_repeats(data)).channels
     assert [c.rate_hz for c in masked] == pytest.approx([100, 20])
-    advice = advise(data, "log.csv")
-    assert "about 20 values of the slowest channel, at 20 Hz" in " ".join(advice.reasons)
-    assert "--split.mask=dropout" in advice.command
+    chosen = plan(data)
+    assert chosen.longest_silence_s == pytest.approx(0.05), "the step of the slow sensor"
+    assert chosen.split.mask == "dropout"
+    assert chosen.sensors == (("fast",), ("slow",))
     as_read = assemble(
         [Recording((Signal("", 10_000_000 * rows, values.copy(), one.names),))],
         ReaderOptions(repeated="mask"),
@@ -95,11 +106,56 @@ def test_the_command_of_the_advice_trains(damaged, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     small = ["--model.name=gru", "--model.hidden_size=4", "--training.epochs=1"]
     assert main([*told["advice"]["command"][1:], *small]) == 0
+    said = capsys.readouterr().err
+    for reason in told["advice"]["reasons"]:
+        assert f"offbeat: {reason}" in said
     kept = json.loads((tmp_path / "run" / "reader.json").read_text())
-    assert kept == {"without": ["broken"], "repeated": "mask", "angles": ["yaw"]}
+    assert kept == {"outliers": "mask", "repeated": "mask", "angles": ["yaw"]}
     predictions = tmp_path / "predictions.csv"
     assert main(["predict", str(tmp_path / "run"), str(damaged), str(predictions)]) == 0
-    assert "broken" not in predictions.read_text().splitlines()[0]
+    assert "broken" in predictions.read_text().splitlines()[0], "no column is lost"
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "run"), str(damaged), "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out)
+    trained = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert scores["part"] == "test", "evaluate finds the split of the training again"
+    assert scores["predictors"] == trained["predictors"]
+
+
+def test_what_cannot_be_trained_on_is_inspected_all_the_same(tmp_path, capsys):
+    path = tmp_path / "still.csv"
+    path.write_text("time,a,b\n" + "".join(f"{0.01 * i},1,2\n" for i in range(100)))
+    assert main(["inspect", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "constant, so not learned, and given back as they are: a, b" in text
+    assert "It cannot be trained on: there is nothing to learn" in text
+    assert main(["train", str(path), str(tmp_path / "run")]) == 2
+    assert "nothing to learn" in capsys.readouterr().err
+
+
+def test_outliers_copies_and_counters_are_told_in_the_table_and_in_sentences(tmp_path, capsys):
+    rows = np.arange(300)
+    wave = np.sin(0.1 * rows)
+    height = np.where(np.isin(rows, [50, 51, 200]), -999.0, wave)
+    table = np.column_stack([rows / 100, wave, wave, height + 0.5 * (height > -1), rows])
+    path = tmp_path / "log.csv"
+    head = "time,x,x_again,height,seq"
+    np.savetxt(path, table, delimiter=",", header=head, comments="", fmt="%.9g")
+    found = inspect(read(path))
+    channels = {channel.name: channel for channel in found.channels}
+    assert channels["x_again"].copy_of == "x"
+    assert channels["seq"].counter
+    (outliers,) = channels["height"].outliers
+    assert (outliers.value, outliers.count, outliers.at[0]) == (-999.0, 3, (0, 0.5))
+    assert main(["inspect", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "copy of x" in text
+    assert "counter" in text
+    assert "height: 3 values of -999, far from all others, mark missing values (at 0.5 s," in text
+    assert main(["inspect", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["notes"] == list(found.notes)
+    assert told["channels"][2]["outliers"][0]["value"] == -999.0
 
 
 def test_text_ends_in_advice_and_the_picture_shows_the_outage_as_white(damaged, tmp_path, capsys):
@@ -126,7 +182,7 @@ def test_a_real_flight_log_shows_its_streams_gaps_and_dropouts():
     assert any("4 dropouts" in said for said in found.found)
 
 
-def test_an_angle_that_wraps_is_named_in_the_advice():
+def test_an_angle_that_wraps_is_unwrapped_by_the_plan():
     times = np.arange(0, 60, 0.01)
     wrapped = (0.8 * times + np.pi) % (2 * np.pi) - np.pi
     degrees = np.degrees((1.1 * times) % (2 * np.pi))
@@ -135,4 +191,7 @@ def test_an_angle_that_wraps_is_named_in_the_advice():
     names = ("heading", "bearing", "joint", "noise", "position")
     units = ("rad", "deg", "rad", "rad", "m")
     data = ob.Dataset((ob.Trajectory(times, values, names=names, units=units),))
-    assert "--reader.angles=[heading, bearing]" in advise(data, "log.csv").command
+    chosen = plan(data)
+    assert chosen.reader["angles"] == ["heading", "bearing"]
+    heading = prepare(data, chosen)[0].values[:, 0]
+    np.testing.assert_allclose(heading, 0.8 * times, atol=1e-9)

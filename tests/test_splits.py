@@ -260,17 +260,30 @@ def test_a_log_too_short_for_its_parts_says_what_to_do():
 # --- in blocks ------------------------------------------------------------------------------------
 
 
-def test_blocks_of_every_part_are_spread_over_the_log():
-    train, validation, test = split_in_blocks(Dataset((log(1000),)), blocks=2)
-    assert [(int(t.values[0, 0]), t.rows) for t in validation] == [(175, 75), (675, 75)]
-    assert [(int(t.values[0, 0]), t.rows) for t in test] == [(425, 75), (925, 75)]
-    assert [(int(t.values[0, 0]), t.rows) for t in train] == [
-        (0, 175),
-        (250, 175),
-        (500, 175),
-        (750, 175),
-    ]
+@pytest.mark.parametrize("seed", range(5))
+def test_blocks_of_every_part_are_spread_over_the_log(seed):
+    train, validation, test = split_in_blocks(Dataset((log(1000),)), blocks=4, seed=seed)
     assert sorted(rows_of(train) + rows_of(validation) + rows_of(test)) == list(range(1000))
+    for part in (validation, test):
+        middles = np.array([t.values[:, 0].mean() for t in part])
+        assert (middles // 250).tolist() == [0, 1, 2, 3], "one in each quarter"
+        assert all(37 <= t.rows <= 38 for t in part)
+
+
+def test_blocks_follow_from_the_seed_and_are_at_no_regular_places():
+    first, again, other = (
+        [rows_of(part) for part in split_in_blocks(Dataset((log(1000),)), seed=seed)]
+        for seed in (1, 1, 2)
+    )
+    assert first == again
+    assert first[1] != other[1]
+    phases = [
+        float(t.values[0, 0]) % 200 / 200
+        for seed in range(40)
+        for t in split_in_blocks(Dataset((log(1000),)), blocks=5, seed=seed)[1]
+    ]
+    assert min(phases) < 0.2
+    assert max(phases) > 0.7
 
 
 @given(st.integers(60, 900), st.integers(1, 4), st.floats(0, 0.05), st.integers(1, 4))

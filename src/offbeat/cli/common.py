@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from offbeat.errors import FileFormatError, InputError, one_of, printable
 
 if TYPE_CHECKING:
+    from offbeat.config import SplitConfig
+    from offbeat.data.plan import Plan
     from offbeat.data.trajectory import Dataset
 
 READER_FILE = "reader.json"
@@ -48,6 +52,46 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
     return read(data, **reader_options(reader, run))
 
 
+def read_planned(
+    data: Path,
+    reader: dict[str, Any] | None,
+    *,
+    horizon_s: float | None = None,
+    split: SplitConfig | None = None,
+    seed: int = 0,
+) -> tuple[Dataset, Plan | None]:
+    """Reads a log to train on it: chooses options that are not given, and prepares the data set.
+
+    Args:
+        data: the file.
+        reader: options of `offbeat.read`, which are kept.
+        horizon_s: as of `plan`.
+        split: as of `plan`.
+        seed: as of `plan`.
+
+    Returns:
+        The data set as a model is trained on it, and what was chosen for it; None for a data set
+        of ours, which is finished and taken as it is.
+
+    Raises:
+        FileFormatError: as `read`.
+        InputError: as `read` and `plan`.
+    """
+    from offbeat.data.plan import CHOSEN, plan, prepare
+
+    given = dict(reader or {})
+    known = [option for option in CHOSEN if option in known_options(data, given)]
+    first = {"outliers": "mask", **given} if "outliers" in known else given
+    dataset = read_log(data, first)
+    if "cleaning" not in dataset.meta:
+        return dataset, None
+    chosen = plan(dataset, reader=first, known=known, horizon_s=horizon_s, split=split, seed=seed)
+    if chosen.reader != first:
+        with without_warnings():
+            dataset = read_log(data, dict(chosen.reader))
+    return prepare(dataset, chosen), chosen
+
+
 def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str, Any]:
     """The options given, completed by those that the run was trained with.
 
@@ -66,6 +110,21 @@ def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str,
             f"{run / READER_FILE} is damaged ({error}); give --reader.format and other options"
         ) from None
     return {**kept, **given}
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """While this lasts, what readers assume is not printed as warnings."""
+    logger = logging.getLogger("offbeat")
+    logger.addFilter(_no_warning)
+    try:
+        yield
+    finally:
+        logger.removeFilter(_no_warning)
+
+
+def _no_warning(record: logging.LogRecord) -> bool:
+    return record.levelno > logging.WARNING
 
 
 def known_options(

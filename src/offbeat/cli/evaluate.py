@@ -65,6 +65,7 @@ def evaluate_command(
     from offbeat.answers.two_sided import TwoSided
     from offbeat.cli.scored import fill_figure, scored
     from offbeat.data.masking import mask_out
+    from offbeat.data.redundant import leave_out_of
     from offbeat.data.splits import load_split
     from offbeat.evaluation import evaluate
     from offbeat.files import write_json
@@ -76,7 +77,9 @@ def evaluate_command(
     check_figure(figure)
     after = None if horizons is None else checked_horizons(horizons).tolist()
     loaded = load_run(model)
-    dataset = read_log(data, reader, run=model)
+    forward = loaded.forward if isinstance(loaded, TwoSided) else loaded
+    # As in training, where these channels were not masked.
+    dataset = leave_out_of(read_log(data, reader, run=model), forward.transforms)
     own = load_split(model / "split.json", dataset)
     if own is None and part not in (None, "all"):
         raise InputError(
@@ -102,7 +105,6 @@ def evaluate_command(
                 burst_s=burst_s,
                 seed=seed,
             )
-    forward = loaded.forward if isinstance(loaded, TwoSided) else loaded
     chosen = plotted_channels(forward.names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = evaluate(forward, dataset, seed=seed)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
-from offbeat.cli.common import say
-from offbeat.errors import one_of
+from offbeat.cli.common import say, without_warnings
+from offbeat.errors import InputError, one_of
 
 
 def inspect_command(
@@ -17,7 +16,7 @@ def inspect_command(
     run: Path = Path("runs/log"),
     json: bool = False,
 ) -> None:
-    """Inspect a log: rates, gaps, repeated values, anomalies, and a command that trains on it.
+    """Inspect a log: rates, gaps, outliers, anomalies, and the command that trains on it.
 
     Args:
         data: the log, of any format that Offbeat reads: a file, or the folder of a data set.
@@ -35,37 +34,40 @@ def inspect_command(
         one_of("suffix of out", out.suffix.lower(), (".png", ".pdf", ".svg"))
         writable(out)
     # The warnings of the reader are part of the output.
-    logging.getLogger("offbeat").addFilter(_silence)
-    try:
+    with without_warnings():
         dataset = read(data, **(reader or {}))
-    finally:
-        logging.getLogger("offbeat").removeFilter(_silence)
     inspection = inspect(dataset)
     known = READERS[inspection.format].options if inspection.format in READERS else ()
-    advice = advise(dataset, str(data), str(run), reader=reader, known=known)
     result = inspection.to_dict()
-    result["advice"] = {"command": list(advice.command), "reasons": list(advice.reasons)}
+    try:
+        advice = advise(dataset, str(data), str(run), reader=reader, known=known)
+        result["advice"] = {"command": list(advice.command), "reasons": list(advice.reasons)}
+        trained = ["To train on it:", "", f"  {str(advice).replace(chr(10), chr(10) + '  ')}", ""]
+        trained += ["which chooses:", *(f"  - {reason}" for reason in advice.reasons)]
+    except InputError as error:
+        result["advice"] = {"command": None, "reasons": [str(error)]}
+        trained = [f"It cannot be trained on: {error}"]
     if out is not None:
         from offbeat.plots.figures import save
         from offbeat.plots.log import log
 
         save(log(dataset, inspection, title=data.name), out)
         result["figure"] = str(out)
-    say(result, _text(inspection, advice, out), json)
+    say(result, "\n".join([*_text(inspection), *trained, *_figure(out)]), json)
 
 
-def _silence(record: logging.LogRecord) -> bool:
-    return record.levelno > logging.WARNING
-
-
-def _text(inspection: Any, advice: Any, out: Path | None) -> str:
+def _text(inspection: Any) -> list[str]:
     from offbeat.cli.inspection_text import channel_table, episode_table, heading
 
-    lines = [heading(inspection), "", channel_table(inspection), "", episode_table(inspection)]
-    if inspection.found:
-        lines += ["", "Found while reading:", *(f"  - {said}" for said in inspection.found)]
-    lines += ["", "To train on it:", "", f"  {str(advice).replace(chr(10), chr(10) + '  ')}", ""]
-    lines += [f"  - {reason}" for reason in advice.reasons]
-    if out is not None:
-        lines += ["", f"{out}: when each channel was measured"]
-    return "\n".join(lines)
+    lines = [heading(inspection), "", channel_table(inspection), "", episode_table(inspection), ""]
+    for title, said in (
+        ("Found while reading:", inspection.found),
+        ("Found in the values:", inspection.notes),
+    ):
+        if said:
+            lines += [title, *(f"  - {sentence}" for sentence in said), ""]
+    return lines
+
+
+def _figure(out: Path | None) -> list[str]:
+    return [] if out is None else ["", f"{out}: when each channel was measured"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from offbeat.data.inspection import EpisodeInspection, Inspection
+from offbeat.data.inspection import ChannelInspection, EpisodeInspection, Inspection
 from offbeat.tables import plain
 
 _MOST_EPISODES = 12
@@ -39,7 +39,7 @@ def channel_table(inspection: Inspection) -> str:
                 f"{100 * c.missing:.1f}",
                 f"{100 * c.lost:.1f}",
                 _number(c.longest_gap_s, 4),
-                "constant" if c.constant else repeated,
+                _kind(c) or repeated,
                 "never known" if not c.known else f"{_number(c.low, 4)} to {_number(c.high, 4)}",
             )
         )
@@ -55,6 +55,12 @@ def channel_table(inspection: Inspection) -> str:
         "range",
     )
     return plain([header, *rows], left=(0, 1, 7, 8))
+
+
+def _kind(channel: ChannelInspection) -> str:
+    if channel.constant:
+        return "constant"
+    return f"copy of {channel.copy_of}" if channel.copy_of else "counter" * channel.counter
 
 
 def episode_table(inspection: Inspection) -> str:

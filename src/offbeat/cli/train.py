@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from offbeat.cli.common import READER_FILE, plain, read_log, say
+from offbeat.cli.common import READER_FILE, plain, read_planned, say
 from offbeat.config import ModelConfig, SplitConfig, check_seed
 from offbeat.errors import InputError, one_of
 
@@ -21,7 +21,8 @@ def train_command(
     model: ModelConfig = ModelConfig(),  # noqa: B008  # frozen
     training: dict[str, Any] | None = None,
     split: SplitConfig = SplitConfig(),  # noqa: B008
-    scaler: str = "standardise",
+    scaler: str | None = None,
+    horizon_s: float | None = None,
     two_sided: bool = False,
     reader: dict[str, Any] | None = None,
     seed: int = 0,
@@ -31,8 +32,10 @@ def train_command(
 ) -> None:
     """Train a model on a data set, and score it on the test part.
 
-    Each model has a training recipe of its own; options of the training that are not given are
-    those of the recipe. The weights with the best validation error are kept.
+    How a log is cleaned and split, and which channels are left out, is found in the log, and said;
+    options that are given are kept. Each model has a training recipe of its own; options of the
+    training that are not given are those of the recipe. The weights with the best validation error
+    are kept.
 
     Args:
         data: the log, of any format that Offbeat reads.
@@ -40,9 +43,11 @@ def train_command(
             was stopped continues from its last checkpoint.
         model: what the model consists of; only the name is needed.
         training: of epochs, optimizer and the rest, those that differ from the model's recipe.
-        split: windows, masked values, and the split into training, validation and test part.
+        split: windows, masked values, and the split into training, validation and test part. If
+            no option of it is given, all are found in the log.
         scaler: standardise, robust, min_max, divide_by_max or identity; fitted on the training
-            part.
+            part. By default robust, and standardise for a data set in the format of Offbeat.
+        horizon_s: s, the longest forecast that will be asked for; by default found in the log.
         two_sided: train a second model on reversed trajectories as well, so that impute can fill
             from both sides; it is saved in the folder backward of the run.
         reader: how the log is read; the run keeps these options for the other commands.
@@ -66,14 +71,23 @@ def train_command(
     from offbeat.models.zoo import make_model, train_config
     from offbeat.training import fit
 
-    one_of("scaler", scaler, SCALERS)
+    if scaler is not None:
+        one_of("scaler", scaler, SCALERS)
     check_seed(seed)
     if threads < 1:
         raise InputError(f"threads must be an integer of at least 1, got {threads}")
     writable(out, folder=True)
     config = train_config(model.name, **{"keep": "best", **(training or {})})
     torch.set_num_threads(threads)
-    dataset = read_log(data, reader)
+    open_split = split == SplitConfig(seed=split.seed)
+    dataset, chosen = read_planned(
+        data, reader, horizon_s=horizon_s, split=None if open_split else split, seed=split.seed
+    )
+    if chosen is not None:
+        reader, split = dict(chosen.reader), chosen.split
+        for note in chosen.notes:
+            print(f"offbeat: {note}", file=sys.stderr)
+    scaler = scaler or ("standardise" if chosen is None else "robust")
     train_part, validation, test = apply_split(dataset, split)
     longest = max(t.rows for t in train_part)
     if longest > LONG:
@@ -97,6 +111,7 @@ def train_command(
         "training": plain(asdict(config)),
         "split": plain(asdict(split)),
         "scaler": scaler,
+        "horizon_s": horizon_s if chosen is None else chosen.horizon_s,
         "two_sided": two_sided,
         "reader": reader,
         "seed": seed,

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning.channels import find_repeats, new_values
 from offbeat.data.cleaning.log import sentences
+from offbeat.data.outliers import Outliers, find_outliers
+from offbeat.data.redundant import find_redundant
 from offbeat.data.trajectory import Dataset
 
 
@@ -38,6 +40,9 @@ class ChannelInspection:
         high: its highest value.
         mean: its mean value.
         constant: whether it has a single value.
+        counter: whether it is a sequence number or a clock.
+        copy_of: the channel that has the same values, or empty.
+        outliers: its values that are no measurements.
     """
 
     name: str
@@ -56,6 +61,9 @@ class ChannelInspection:
     high: float | None
     mean: float | None
     constant: bool
+    counter: bool = False
+    copy_of: str = ""
+    outliers: tuple[Outliers, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,6 +107,8 @@ class Inspection:
         channels: one entry each.
         episodes: one entry each.
         found: sentences on what was found and changed while reading.
+        notes: sentences on values that are no measurements, and on channels that nothing can be
+            learned from.
         cleaning: the full record, see `CleaningLog`; empty for data that were not read.
     """
 
@@ -111,6 +121,7 @@ class Inspection:
     channels: tuple[ChannelInspection, ...]
     episodes: tuple[EpisodeInspection, ...]
     found: tuple[str, ...]
+    notes: tuple[str, ...]
     cleaning: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
@@ -120,7 +131,7 @@ class Inspection:
 
 
 def inspect(dataset: Dataset) -> Inspection:
-    """Inspects a data set: rates, gaps, repeated values and anomalies of its known values.
+    """Inspects a data set: rates, gaps, repeated values, outliers and anomalies.
 
     Args:
         dataset: from `read`.
@@ -128,9 +139,19 @@ def inspect(dataset: Dataset) -> Inspection:
     dataset = Dataset.of(dataset)
     steps = np.concatenate([np.diff(t.times) for t in dataset])
     rows = sum(t.rows for t in dataset)
-    channels = tuple(_channel(dataset, c, rows) for c in range(dataset.channels))
-    known = sum(channel.known for channel in channels)
     cleaning = dict(dataset.meta.get("cleaning", {}))
+    outliers = _outliers(dataset, cleaning)
+    redundant = find_redundant(dataset)
+    channels = tuple(
+        replace(
+            _channel(dataset, c, rows),
+            counter=name in redundant.counters,
+            copy_of=redundant.copies.get(name, ""),
+            outliers=tuple(found for found in outliers if found.name == name),
+        )
+        for c, name in enumerate(dataset.names)
+    )
+    known = sum(channel.known for channel in channels)
     return Inspection(
         source=str(dataset.meta.get("source", "")),
         format=str(dataset.meta.get("format", "offbeat")),
@@ -141,6 +162,7 @@ def inspect(dataset: Dataset) -> Inspection:
         channels=channels,
         episodes=_episodes(dataset, cleaning),
         found=tuple(sentences(cleaning)) if cleaning else (),
+        notes=(*(str(found) for found in outliers), *redundant.notes()),
         cleaning=cleaning,
     )
 
@@ -158,6 +180,14 @@ def without_repeats(dataset: Dataset) -> Dataset:
         for t, v in zip(dataset, columns, strict=True)
     )
     return replace(dataset, trajectories=trajectories)
+
+
+def _outliers(dataset: Dataset, cleaning: dict[str, Any]) -> tuple[Outliers, ...]:
+    """Those that its reader found, before it unwrapped angles, or those in the data."""
+    if "outliers" not in cleaning:
+        return find_outliers(dataset)
+    found = (Outliers.from_dict(entry) for entry in cleaning["outliers"]["found"])
+    return tuple(outliers for outliers in found if outliers.name in dataset.names)
 
 
 def _channel(dataset: Dataset, c: int, rows: int) -> ChannelInspection:

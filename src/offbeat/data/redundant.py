@@ -45,12 +45,12 @@ class Redundant:
         """A sentence for each kind that there is."""
         copies = [f"{one} (of {of})" for one, of in self.copies.items()]
         said = (
-            (list(self.constants), "never change; they are not learned, and stay what they are"),
-            (copies, "are copies; they are not learned, and get the answer of the original"),
-            (list(self.counters), "count or tell the time; they are not learned and not predicted"),
-            (list(self.empty), "have no value; they are not learned and not predicted"),
+            ("constant, so not learned, and given back as they are", list(self.constants)),
+            ("copies, so not learned, and given the answer of the original", copies),
+            ("counters or clocks, so not learned and not predicted", list(self.counters)),
+            ("without a value, so not learned and not predicted", list(self.empty)),
         )
-        return tuple(f"{listed(names)} {what}" for names, what in said if names)
+        return tuple(f"{what}: {listed(names)}" for what, names in said if names)
 
 
 def find_redundant(dataset: Dataset) -> Redundant:
@@ -107,25 +107,39 @@ def leave_out(dataset: Dataset, redundant: Redundant) -> Dataset:
     Raises:
         InputError: no state would be left.
     """
-    names = set(redundant.names)
+    transforms = Transforms(
+        constants=redundant.constants,
+        copies=redundant.copies,
+        ignored=(*redundant.counters, *redundant.empty),
+    )
+    left = leave_out_of(dataset, transforms)
+    if redundant.names and all(role == EXOGENOUS for role in left.roles):
+        raise InputError(
+            f"there is nothing to learn: {'; '.join(redundant.notes())}; give a log in which "
+            "something else changes"
+        )
+    return left
+
+
+def leave_out_of(dataset: Dataset, transforms: Transforms) -> Dataset:
+    """As `leave_out`, with the channels that the transforms of a model leave out.
+
+    Args:
+        dataset: in original units.
+        transforms: of the model.
+    """
+    names = set(transforms.left_out) & set(dataset.names)
     if not names:
         return dataset
     roles = tuple(
         EXOGENOUS if name in names else role
         for name, role in zip(dataset.names, dataset.roles, strict=True)
     )
-    if all(role == EXOGENOUS for role in roles):
-        raise InputError(
-            f"there is nothing to learn: {'; '.join(redundant.notes())}; give a log in which "
-            "something else changes"
-        )
-    transforms = Transforms(
-        constants=redundant.constants,
-        copies=redundant.copies,
-        ignored=(*redundant.counters, *redundant.empty),
-    )
     marked = replace(dataset, trajectories=tuple(replace(t, roles=roles) for t in dataset))
-    return transforms.apply(marked)
+    out = Transforms(
+        constants=transforms.constants, copies=transforms.copies, ignored=transforms.ignored
+    )
+    return out.apply(marked)
 
 
 def _counts(known: list[NDArray[np.float64]]) -> bool:

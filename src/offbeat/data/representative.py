@@ -84,24 +84,29 @@ def _motion(columns: Sequence[Values]) -> float:
 
 
 def _sentences(part: str, found: dict[str, list[str]], compared: int) -> list[str]:
-    said = []
     less = found.get("less motion", [])
     if less and 2 * len(less) >= compared:
-        said.append(
-            f"the {part} part is at rest: {listed(less)} change less than a fifth as much as in "
-            f"training, so its scores say little about motion; record more, or split differently"
-        )
-    elif less:
-        said.append(
-            f"{listed(less)} change less than a fifth as much in the {part} part as in training; "
-            "its scores of them are those of a sensor at rest"
-        )
-    for kind, what, meaning in (
-        ("range", "leave the range of the training part", "predictions there are extrapolations"),
-        ("more motion", "change more than 5 times as much as in training", "expect larger errors"),
-        ("less spread", "vary less than a third as much as in training", "scores are flattered"),
-        ("more spread", "vary more than 3 times as much as in training", "expect larger errors"),
+        said = [
+            f"the {part} part is at rest: {_who(less, 'change')} less than a fifth as much as in "
+            "training, so its scores say little about motion; record more, or split differently"
+        ]
+    else:
+        said = [
+            f"in the {part} part, {_who(less, 'change')} less than a fifth as much as in training; "
+            "its scores of that are those of a sensor at rest"
+        ] * bool(less)
+    for kind, verb, what in (
+        ("range", "leave", "the range of the training part; predictions there are extrapolations"),
+        ("more motion", "change", "more than 5 times as much as in training; errors are larger"),
+        ("less spread", "vary", "less than a third as much as in training; scores are flattered"),
+        ("more spread", "vary", "more than 3 times as much as in training; errors are larger"),
     ):
         if names := found.get(kind):
-            said.append(f"in the {part} part, {listed(names)} {what}; {meaning}")
+            said.append(f"in the {part} part, {_who(names, verb)} {what}")
     return said
+
+
+def _who(names: list[str], verb: str) -> str:
+    """Names and the verb in their number."""
+    one = {"change": "changes", "leave": "leaves", "vary": "varies"}[verb]
+    return f"{listed(names)} {one if len(names) == 1 else verb}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from offbeat.files import write_json
 
 _BLOCK_ROWS = 50
 _MOST_BLOCKS = 5
+_AROUND = (4.0, 4.0, 4.0)  # of the Dirichlet distribution of the training rows around two blocks
 
 
 def split(
@@ -89,12 +91,13 @@ def split_in_blocks(
     *,
     blocks: int | None = None,
     gap_s: float = 0.0,
+    seed: int = 0,
 ) -> tuple[Dataset, Dataset, Dataset]:
     """Splits a recording in blocks: validation and test come from several places of it.
 
-    The rows are divided into as many sections as there are blocks. In each section, half of the
-    training rows come first, then a validation block, the other half, and a test block. Several
-    trajectories count as one recording, as in `split_in_time`.
+    The rows are divided into as many sections as there are blocks. Each section has a validation
+    and a test block, in random order and at random places: a motion that repeats itself is met at
+    other phases. Several trajectories count as one recording, as in `split_in_time`.
 
     Args:
         dataset: a recording, its trajectories in the order of time.
@@ -102,6 +105,7 @@ def split_in_blocks(
         blocks: validation blocks, and as many test blocks; by default as many as have 50 rows or
             more, from 1 to 5.
         gap_s: s, training rows this near to a row of another part are left out.
+        seed: of the places.
 
     Returns:
         Training, validation and test part; a trajectory per block.
@@ -113,26 +117,22 @@ def split_in_blocks(
     rows = sum(t.rows for t in dataset)
     if len(fractions) != 3:
         raise InputError(f"a split in blocks has three fractions, got {list(fractions)}")
-    train, validation, test = fractions
     _ends(rows, fractions)  # checks them
     if blocks is None:
-        blocks = min(max(int(rows * min(validation, test)) // _BLOCK_ROWS, 1), _MOST_BLOCKS)
-    section = np.array([train / 2, validation, train / 2, test]) / blocks
-    ends = np.floor(np.cumsum(np.tile(section, blocks)) * rows + 0.5).astype(np.int64)
-    ends[-1] = rows
+        smallest = int(rows * min(fractions[1:]))
+        blocks = min(max(smallest // _BLOCK_ROWS, 1), _MOST_BLOCKS)
+    part_of_row = _blocks(rows, fractions, blocks, np.random.default_rng(seed))
     pieces: list[list[Trajectory]] = [[], [], []]
     before = 0
     for trajectory in dataset:
-        start = 0
-        for i, end in enumerate(ends):
-            stop = min(max(int(end) - before, start), trajectory.rows)
-            part = (0, 1, 0, 2)[i % 4]
+        own = part_of_row[before : before + trajectory.rows]
+        edges = [0, *(np.flatnonzero(np.diff(own)) + 1).tolist(), trajectory.rows]
+        for start, stop in pairwise(edges):
             first, last = start, stop
-            if part == 0 and gap_s > 0 and stop > start:
+            if own[start] == 0:
                 first, last = _apart(trajectory.times, start, stop, gap_s)
             if last - first >= 2:
-                pieces[part].append(trajectory.slice(first, last))
-            start = stop
+                pieces[own[start]].append(trajectory.slice(first, last))
         before += trajectory.rows
     if not all(pieces):
         raise InputError(
@@ -143,8 +143,27 @@ def split_in_blocks(
     return made[0], made[1], made[2]
 
 
+def _blocks(
+    rows: int, fractions: Sequence[float], blocks: int, random: np.random.Generator
+) -> NDArray[np.int64]:
+    """(rows,) the part of each row: 0 training, 1 validation, 2 test."""
+    part_of_row = np.zeros(rows, dtype=np.int64)
+    for section in range(blocks):
+        around = fractions[0] * random.dirichlet(_AROUND)  # training before, between and after
+        order = random.permutation([1, 2])
+        start = section
+        for training, part in zip(around, order, strict=False):
+            start += training
+            ends = [start, start := start + fractions[part]]
+            first, last = np.floor(np.array(ends) * rows / blocks + 0.5).astype(np.int64)
+            part_of_row[first:last] = part
+    return part_of_row
+
+
 def _apart(times: NDArray[np.float64], start: int, stop: int, gap_s: float) -> tuple[int, int]:
     """First row and end of the rows of a block that are `gap_s` away from those around it."""
+    if not gap_s:
+        return start, stop
     if start > 0:
         start = max(start, int(np.searchsorted(times, times[start - 1] + gap_s, side="right")))
     if stop < len(times):
@@ -177,7 +196,11 @@ def apply_split(dataset: Dataset, config: SplitConfig) -> tuple[Dataset, Dataset
             split_in_time(dataset, config.fractions)
             if config.by == "time"
             else split_in_blocks(
-                dataset, config.fractions, blocks=config.blocks, gap_s=config.gap_s or 0.0
+                dataset,
+                config.fractions,
+                blocks=config.blocks,
+                gap_s=config.gap_s or 0.0,
+                seed=config.seed,
             )
         )
         dataset = replace(dataset, trajectories=tuple(t for part in parts for t in part))

@@ -15,6 +15,7 @@ REPEATED_FRACTION = 0.5
 """Minimum fraction of values that equal the previous one, for a channel with repeated values."""
 
 _FEWEST_RUNS = 10
+_LONG_RUN, _FEW_VALUES = 10, 10  # of a switch or a set point
 _BLOCK = 1 << 14  # rows that fit in the cache
 _QUATERNION = re.compile(r"(.*?)(?:^|[._\s\-/]|(?<=q)|(?<=quat)|(?<=quaternion))([wxyz])")
 _ROTATION = re.compile(r"q$|quat|orient|rotation|attitude|(^|[._\s\-/])q", re.IGNORECASE)
@@ -39,7 +40,7 @@ def find_repeats(columns: Sequence[Values]) -> Repeats | None:
     It does if at least half of its known values equal the previous one, in 10 runs of equal values
     or more whose median length is 2 or more. A channel that is constant at times and otherwise
     changes at every row has mostly runs of one value and does not count, nor does a constant
-    channel.
+    channel, or a switch or a set point: few values, each for more than 10 rows.
 
     Args:
         columns: (rows,) its values in each episode, NaN = missing.
@@ -60,6 +61,10 @@ def find_repeats(columns: Sequence[Values]) -> Repeats | None:
     if len(runs) < _FEWEST_RUNS:
         return None
     usual = int(np.median(runs))
+    if usual > _LONG_RUN:
+        distinct = len(np.unique(np.concatenate(columns)))
+        if distinct <= max(_FEW_VALUES, len(runs) // 10):
+            return None
     return Repeats(repeats / pairs, usual) if usual >= 2 else None
 
 
