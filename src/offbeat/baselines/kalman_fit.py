@@ -176,7 +176,8 @@ def search(
     random = np.random.default_rng(seed)
     drawn = random.uniform(low, high, size=(CANDIDATES - len(special), len(low)))
     tried = np.concatenate([special, drawn])[:, :, None] + np.zeros(chains)
-    best, lowest = tried[0], np.full(chains, np.inf)
+    best: Array = tried[0]
+    lowest = np.full(chains, np.inf)
     for width in (None, *ROUNDS):
         if width is not None:
             tried = best + width * random.normal(size=(STEPS, len(low), chains))
