@@ -340,5 +340,5 @@ def test_channels_of_very_different_scale_are_fitted_alike():
                 )
             ),
         )
-        assert scaled.chains.damping == pytest.approx(plain.chains.damping, rel=1e-6)
-        assert scaled.chains.drive == pytest.approx(plain.chains.drive, rel=1e-6)
+        assert scaled.banks[0].damping == pytest.approx(plain.banks[0].damping, rel=1e-6)
+        assert scaled.banks[0].drive == pytest.approx(plain.banks[0].drive, rel=1e-6)

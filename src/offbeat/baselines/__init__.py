@@ -18,7 +18,7 @@ from offbeat.baselines.base import (
 )
 from offbeat.baselines.folds import cross_fitted, folds_of
 from offbeat.baselines.history import AgeBins, History
-from offbeat.baselines.kalman_fit import ChannelKalman, ChannelKalmanLong, ChannelSmoother
+from offbeat.baselines.kalman_channels import KalmanLong, KalmanShort, Smoother
 from offbeat.baselines.ridge import Ridge
 from offbeat.baselines.simple import (
     ConstantVelocity,
@@ -36,18 +36,18 @@ __all__ = [
     "AgeBins",
     "Baseline",
     "CausalBaseline",
-    "ChannelKalman",
-    "ChannelKalmanLong",
-    "ChannelSmoother",
     "ConstantVelocity",
     "DampedSlope",
     "History",
+    "KalmanLong",
+    "KalmanShort",
     "LastValue",
     "Linear",
     "Mean",
     "Pchip",
     "Ridge",
     "RunningMean",
+    "Smoother",
     "causal_baselines",
     "cross_fitted",
     "fill",

@@ -296,15 +296,16 @@ class Chains:
         Returns:
             (..., batch, rows, chains) per state, in units of the channels.
         """
-        count = rows.times.shape[1]
-        gaps = np.diff(rows.times, axis=1, prepend=rows.times[:, :1])
+        times = _times(rows)
+        count = times.shape[1]
+        gaps = np.diff(times, axis=1, prepend=times[:, :1])
         empty = np.zeros((len(rows.times), len(self.channels)))
         belief = self._before(empty)
         steps: list[Transition] = []
         before: list[Belief] = []
         updates: list[list[Update]] = []
         for i in range(count):
-            steps.append(self._transition(gaps[:, i, None] + empty))
+            steps.append(self._transition(gaps[:, i] + empty))
             before.append(belief.moved(steps[-1]))
             masks = self._masks(rows.observed[:, i])
             belief, made = self._measured(before[-1], rows.values[:, i], masks)
@@ -398,16 +399,21 @@ class Chains:
 
 
 def filtered(chains: Chains, rows: Rows) -> list[Array]:
-    """What a filter predicts for every row: (candidates, batch, rows, chains) per state."""
+    """What a filter predicts for every row: (..., batch, rows, chains) per state."""
+    times = _times(rows)
     state = chains.start(np.zeros((rows.values.shape[0], rows.values.shape[2])))
     reads = []
-    for i in range(rows.values.shape[1]):
-        time = rows.times[:, i, None]
-        moved = chains.moved(state, time)
+    for i in range(times.shape[1]):
+        moved = chains.moved(state, times[:, i])
         seen = [state[f"seen{j}"] for j in range(chains.order)]
         reads.append(chains.in_units(moved.mean, seen))
-        state = chains.committed(state, moved, time, rows.values[:, i], rows.observed[:, i])
+        state = chains.committed(state, moved, times[:, i], rows.values[:, i], rows.observed[:, i])
     return [np.stack([r[j] for r in reads], axis=-2) for j in range(chains.order)]
+
+
+def _times(rows: Rows) -> Array:
+    """(batch, rows, 1) s; (batch, rows, chains) where every chain has rows of its own."""
+    return rows.times if rows.times.ndim == 3 else rows.times[..., None]
 
 
 def _transposed(matrix: list[list[Any]], vector: list[Any]) -> list[Any]:
