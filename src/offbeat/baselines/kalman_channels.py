@@ -56,7 +56,7 @@ class Wiring:
         factors: ArrayLike,
         mean: Array,
         scale: Array,
-        longest: float,
+        longest: Array,
     ) -> Wiring:
         """The wiring of chains.
 
@@ -67,7 +67,7 @@ class Wiring:
                 position's channel.
             mean: (channels,) of the data.
             scale: (channels,) of the data.
-            longest: s.
+            longest: (chains,) s.
         """
         index = np.array(channels, dtype=np.int64)
         clock = np.array([_gap(tasks, row) for row in index])
@@ -76,7 +76,7 @@ class Wiring:
         unit = unit * np.asarray(factors, dtype=np.float64)
         prior = np.where(index >= 0, mean[np.maximum(index, 0)], 0.0) / unit
         prior[:, 0] = 0.0
-        return cls(index, unit, mean[index[:, 0]], prior.T, clock, np.full(len(index), longest))
+        return cls(index, unit, mean[index[:, 0]], prior.T, clock, longest)
 
     def chains(self, parameters: Array) -> Chains:
         """Chains of these parameters.
@@ -290,11 +290,10 @@ def singles(baseline: ChainBaseline, tasks: Dataset, which: str) -> tuple[Chains
     channels = [[c, -1] for c in range(tasks.channels)]
     factors = np.ones((tasks.channels, 2))
     sample = Sample.of(tasks, np.array(channels), two_sided=not baseline.causal)
-    longest = float(sample.bins.edges[-1])
-    wiring = Wiring.of(tasks, channels, factors, baseline.mean, baseline.scale, longest)
-    weights = sample.weights()
-    if which != "all":
-        weights = sample.halves()[which == "long"]
+    weights = sample.weights() if which == "all" else sample.halves()[which == "long"]
+    wiring = Wiring.of(
+        tasks, channels, factors, baseline.mean, baseline.scale, sample.longest(weights)[:, 0]
+    )
     chains, losses = fit_chains(wiring, sample, baseline.scale, weights)
     return chains, losses[:, 0]
 

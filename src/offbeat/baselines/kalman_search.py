@@ -155,6 +155,15 @@ class Sample:
         """(bins, columns) weights of all bins: 1, or next to none where there are few values."""
         return np.where(self.count >= FEW, 1.0, 1e-6 * (self.count > 0))
 
+    def longest(self, weights: Array) -> Array:
+        """(chains, order) s, upper end of the last bin that counts.
+
+        Args:
+            weights: (bins, columns).
+        """
+        last = np.max((weights > 0.5) * np.arange(1, len(weights) + 1)[:, None], axis=0)
+        return np.asarray(self.bins.edges[last - 1].reshape(self.index.shape))
+
     def loss(self, errors: Array, weights: Array, scale: Array) -> Array:
         """Mean over bins of log(MSE / MSE of the reference).
 
