@@ -273,3 +273,52 @@ def test_the_answer_of_a_model_alone_has_no_intervals(with_models):
     answer = ob.predict(with_models.forward, waves(4, 1))[0]
     with pytest.raises(ob.InputError, match="no intervals"):
         answer.interval()
+
+
+# --- streams --------------------------------------------------------------------------------------
+
+
+def test_a_stream_of_a_blend_is_the_batch(with_models):
+    (t,) = waves(5, 1)
+    observed = np.random.default_rng(0).random(t.values.shape) < 0.7
+    given = ob.Trajectory(t.times, t.values, observed=observed)
+    batch = ob.predict(with_models, given)[0]
+    stream = ob.Stream(with_models)
+    for row in range(60):
+        if row:
+            low, high = stream.interval(t.times[row], 0.8)
+            predicted = stream.predict(t.times[row])
+            assert predicted == pytest.approx(batch.values[row], rel=1e-5, abs=1e-6)
+            assert high - low == pytest.approx(2 * batch.half_width(0.8)[row], rel=1e-5)
+        stream.observe(t.times[row], np.where(observed[row], t.values[row], np.nan))
+
+
+def test_the_state_of_a_stream_of_a_blend_is_restored_bit_for_bit(with_models):
+    (t,) = waves(5, 1)
+    one, other = ob.Stream(with_models), ob.Stream(with_models)
+    for row in range(30):
+        one.observe(t.times[row], t.values[row])
+    other.restore(one.state())
+    at = t.times[29] + 0.05
+    assert np.array_equal(one.predict(at), other.predict(at))
+    assert np.array_equal(one.interval(at)[0], other.interval(at)[0])
+
+
+def test_a_stream_of_baselines_alone_reorders_late_messages(blend):
+    (t,) = waves(5, 1)
+    one = ob.Stream(blend, late="reorder")
+    other = ob.Stream(blend, late="reorder")
+    for row in range(20):
+        one.observe(t.times[row], t.values[row])
+    order = [*range(10), 11, 10, *range(12, 20)]
+    for row in order:
+        other.observe(t.times[row], t.values[row])
+    assert np.array_equal(one.predict(t.times[20]), other.predict(t.times[20]))
+
+
+def test_a_wild_value_leaves_no_trace_that_grows(with_models):
+    (t,) = waves(5, 1)
+    stream = ob.Stream(with_models)
+    for row in range(150):
+        stream.observe(t.times[row], t.values[row] if row != 20 else [1e30, -1e30, 1e200])
+    assert np.abs(stream.predict(t.times[150])[:2] - t.values[150, :2]).max() < 1.0

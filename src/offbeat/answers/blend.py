@@ -26,7 +26,7 @@ from offbeat.answers.both_sides import (
     gated,
     reversed_in_time,
 )
-from offbeat.answers.intervals import HalfWidths, fit_half_widths
+from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
 from offbeat.baselines.base import Array
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.stack import Stack, errors_of, fit_stack, independent_tasks, kinds_of, within
@@ -40,6 +40,9 @@ CAUSAL_MEMBERS = ("last_value", "constant_velocity", "damped_slope", "mean", "ru
 
 TWO_SIDED_MEMBERS = ("last_value", "linear", "pchip")
 """Baselines of the fills of a blend."""
+
+FARTHEST = 1e6
+"""Observed values are limited to this many deviations from the mean, so that squares are finite."""
 
 TASKS = 800
 """Tasks that are drawn from the training data and from the validation data, at most."""
@@ -97,23 +100,63 @@ class Blend:
             dataset: transformed, of these channels in this order; masked values are not used.
             seed: of the generator of self-feeding.
         """
+        dataset = self._limited(dataset)
         models = model_rows(self.forward, dataset, seed=seed)
-        channel = np.arange(self.channels)
-        units = self.stack.keys.units()
-        longest = float(self.stack.keys.bins.edges[-1]) * (1 + 1e-6)
         answers = []
         kinds = kinds_of(self.stack.keys, dataset)
         every = zip(dataset, self.stack.predict(dataset), kinds, strict=True)
         for i, (trajectory, base, kind) in enumerate(every):
-            key, age, last = kind[..., 0].astype(np.int64), kind[..., 2], kind[..., 3]
-            values, beyond = base, age > longest
-            if models is not None:
-                gamma = np.where(beyond, 0.0, self.gamma[key, channel])
-                values = self.stack.bounded(base + gamma * (models[i] - base), last)
-            edge = (values <= self.stack.low) | (values >= self.stack.high)
-            unit = units[key, channel] * kind[..., 1] ** 0.25
-            answers.append(self._answer(trajectory, values, self.widths, key, unit, beyond | edge))
+            values, beyond = self.corrected(base, None if models is None else models[i], kind)
+            key, unit = kind[..., 0].astype(np.int64), self._unit(kind)
+            answers.append(self._answer(trajectory, values, self.widths, key, unit, beyond))
         return answers
+
+    def corrected(
+        self, base: Array, model: Array | None, kind: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """The causal answer: base + gamma (model - base), within the range of answers.
+
+        Args:
+            base: (rows, channels) of the stack.
+            model: (rows, channels) of the forward model, or None.
+            kind: (rows, channels, 4) of `Keys.read`.
+
+        Returns:
+            The answer, and where it is beyond what was trained; see `Answer.beyond`.
+        """
+        key, age, last = kind[..., 0].astype(np.int64), kind[..., 2], kind[..., 3]
+        beyond = age > float(self.stack.keys.bins.edges[-1]) * (1 + 1e-6)
+        values = base
+        if model is not None:
+            gamma = np.where(beyond, 0.0, self.gamma[key, np.arange(self.channels)])
+            values = self.stack.bounded(base + gamma * (model - base), last)
+        return values, beyond | (values <= self.stack.low) | (values >= self.stack.high)
+
+    def half_width(self, kind: Array, level: float) -> Array:
+        """(rows, channels) half widths of causal intervals, in original units.
+
+        Args:
+            kind: (rows, channels, 4) of `Keys.read`.
+            level: probability of the interval.
+        """
+        return half_width(self.widths.at(kind[..., 0].astype(np.int64), self._unit(kind)), level)
+
+    def _unit(self, kind: Array) -> Array:
+        units = self.stack.keys.units()[kind[..., 0].astype(np.int64), np.arange(self.channels)]
+        return np.asarray(units * kind[..., 1] ** 0.25)
+
+    def limited(self, values: Array) -> Array:
+        """Values that are finite in all computations: within `FARTHEST` deviations of the mean."""
+        reach = FARTHEST * self.stack.scale
+        return np.clip(values, self.stack.mean - reach, self.stack.mean + reach)
+
+    def _limited(self, dataset: Dataset) -> Dataset:
+        reach = FARTHEST * self.stack.scale
+        far = [np.abs(np.nan_to_num(t.values) - self.stack.mean) > reach for t in dataset]
+        if not any(f.any() for f in far):
+            return dataset
+        every = (replace(t, values=self.limited(t.values)) for t in dataset)
+        return replace(dataset, trajectories=tuple(every))
 
     def fill(self, dataset: Dataset, *, seed: int = 0) -> list[Answer]:
         """Predicts every value that is not observed, from the observations on both sides.
@@ -122,6 +165,7 @@ class Blend:
             dataset: as of `causal`.
             seed: of the generator of self-feeding.
         """
+        dataset = self._limited(dataset)
         causal = [answer.values for answer in self.causal(dataset, seed=seed)]
         models = model_fills(self.forward, self.backward, dataset, seed=seed)
         channel = np.arange(self.channels)

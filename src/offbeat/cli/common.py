@@ -149,19 +149,25 @@ def known_options(
     return [option for option in found.options if option not in given]
 
 
-def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) -> dict[str, Any]:
+def answer_columns(
+    dataset: Dataset, answers: Dataset, *, masks: bool = True, level: float = 0.9
+) -> dict[str, Any]:
     """The table that commands write: times, one column per channel, and its observed mask.
 
     Args:
         dataset: as it was read; its labels and its clock are restored.
         answers: one trajectory per trajectory of the data set.
         masks: add a column `name|observed` per channel, true where the value was measured.
+        level: probability of the intervals, whose ends are `name|low` and `name|high` where the
+            answers have any; `name|beyond` is true where an answer is beyond what was trained, for
+            channels that have such answers.
 
     Raises:
         InputError: a channel has the name of another column.
     """
     import numpy as np
 
+    from offbeat.answers.answer import Answer
     from offbeat.data.trajectory import SECONDS_PER
 
     each = [t.rows for t in answers]
@@ -180,9 +186,20 @@ def answer_columns(dataset: Dataset, answers: Dataset, *, masks: bool = True) ->
     if masks:
         observed = np.concatenate([t.observed for t in answers])
         added |= {f"{name}|observed": observed[:, i] for i, name in enumerate(answers.names)}
+    each_has = answers.channels * (2 if masks else 1)
+    blended = [t for t in answers if isinstance(t, Answer) and t.widths is not None]
+    if len(blended) == len(answers):
+        half = np.concatenate([t.half_width(level) for t in blended])
+        added |= {f"{name}|low": (values - half)[:, i] for i, name in enumerate(answers.names)}
+        added |= {f"{name}|high": (values + half)[:, i] for i, name in enumerate(answers.names)}
+        beyond = np.concatenate([t.beyond for t in blended if t.beyond is not None])
+        marked = [i for i in range(answers.channels) if beyond[:, i].any()]
+        added |= {f"{answers.names[i]}|beyond": beyond[:, i] for i in marked}
+        each_has += answers.channels * 2 + len(marked)
     taken = [name for name in added if name in columns]
-    if taken or len(added) < answers.channels * (2 if masks else 1):
-        twice = taken[0] if taken else next(n for n in answers.names if n.endswith("|observed"))
+    if taken or len(added) < each_has:
+        endings = ("|observed", "|low", "|high", "|beyond")
+        twice = taken[0] if taken else next(n for n in answers.names if n.endswith(endings))
         raise InputError(f"a channel has the name of another column, {twice!r}; rename it")
     return {**columns, **added}
 

@@ -50,7 +50,7 @@ def forecast_command(
     from offbeat.answers.forecast import checked_horizons, forecast
     from offbeat.cli.scored import forecast_figure
     from offbeat.data.writers.tables import write_table
-    from offbeat.models.checkpoint import load_model
+    from offbeat.answers.saved import load_run
 
     if horizons is None:
         raise InputError(
@@ -59,7 +59,7 @@ def forecast_command(
     check_out(out, data)
     check_figure(figure)
     after = checked_horizons(horizons)
-    loaded = load_model(model)
+    loaded = load_run(model)
     dataset = read_log(data, reader, run=model)
     predicted = forecast(loaded, dataset, after)
     chosen = plotted_channels(predicted.names, channels)

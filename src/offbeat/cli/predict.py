@@ -47,7 +47,7 @@ def predict_command(
     """
     from offbeat.answers.predict import predict
     from offbeat.data.writers.tables import write_table
-    from offbeat.models.checkpoint import load_model
+    from offbeat.answers.saved import load_run
 
     check_out(out, data)
     check_seed(seed)
@@ -57,7 +57,7 @@ def predict_command(
         reader = {**reader_options(reader, model), "time_unit": time_unit}
     if isinstance(times, float):
         times = [times]
-    loaded = load_model(model)
+    loaded = load_run(model)
     dataset = read_log(data, reader, run=model)
     if times is not None:
         _check_since(dataset, times)

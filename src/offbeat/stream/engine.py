@@ -57,6 +57,18 @@ class Engine(ABC):
             (times, channels) in the units of the engine.
         """
 
+    def half_widths(self, times: NDArray[np.float64], level: float) -> NDArray[np.float64] | None:
+        """Half widths of the intervals of predictions, where the engine has any.
+
+        Args:
+            times: as of `predict`.
+            level: probability of the interval.
+
+        Returns:
+            (times, channels) in original units, or None.
+        """
+        return None
+
     @abstractmethod
     def save(self, slot: int) -> None:
         """Copies the state to a slot."""

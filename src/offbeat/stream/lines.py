@@ -22,7 +22,8 @@ class LineSession:
 
     An observation is answered with what was done with it and, where it is a new row, with the
     prediction that was made for it before its values were used: one step ahead. With a horizon, it
-    is answered with the prediction `horizon_s` after the newest row.
+    is answered with the prediction `horizon_s` after the newest row. Where the model is a blend,
+    predictions at a time have `low` and `high` beside them, the ends of their interval of 90 %.
 
     Args:
         stream: takes the observations.
@@ -68,7 +69,7 @@ class LineSession:
             return self._observe(message)
         if keys == {"predict"}:
             t = message["predict"]
-            return {"predict": t, "prediction": self._named(self.stream.predict(t))}
+            return {"predict": t, **self._predicted(t)}
         if keys == {"restore"}:
             self.stream.restore(message["restore"])
             return {"restored": True}
@@ -90,8 +91,17 @@ class LineSession:
             return {"t": t, "outcome": outcome, "prediction": self._named(predicted)}
         outcome = self.stream.observe(t, values, now=now)
         at = self.stream.after(self.horizon_s)
-        after = None if at is None else self.stream.predict(at)
-        return {"t": t, "outcome": outcome, "at": at, "prediction": self._named(after)}
+        after = {"prediction": None} if at is None else self._predicted(at)
+        return {"t": t, "outcome": outcome, "at": at, **after}
+
+    def _predicted(self, t: Any) -> dict[str, Any]:
+        """The prediction at a time, and its interval of 90 % where the model has one."""
+        predicted = self.stream.predict(t)
+        answer = {"prediction": self._named(predicted)}
+        if self.stream.has_intervals:
+            half = self.stream.half_width(t).reshape(predicted.shape)
+            answer |= {"low": self._named(predicted - half), "high": self._named(predicted + half)}
+        return answer
 
     def _command(self, key: str) -> dict[str, Any]:
         if key == "state":

@@ -196,6 +196,44 @@ class LiveStream:
         predicted = self._predict(np.array(asked))
         return predicted if several else predicted[0]
 
+    def interval(
+        self, t: Time | ArrayLike, level: float = 0.9
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The interval around `predict` that holds the true value with a probability.
+
+        Args:
+            t: as of `predict`.
+            level: the probability, at most 0.98.
+
+        Returns:
+            Lower and upper end, each of the shape that `predict` returns.
+
+        Raises:
+            InputError: as `predict`, the level is out of range, or the model has no intervals.
+        """
+        predicted = self.predict(t)
+        half = self.half_width(t, level).reshape(predicted.shape)
+        return predicted - half, predicted + half
+
+    def half_width(self, t: Time | ArrayLike, level: float = 0.9) -> NDArray[np.float64]:
+        """(times, channels) half the width of `interval`; the arguments are the same."""
+        asked = [
+            self._asked(self._clock.read(one)) for one in np.atleast_1d(np.asarray(t)).tolist()
+        ]
+        half = self._engine.half_widths(np.array(asked), level)
+        if half is None:
+            raise InputError(
+                "this stream runs a model alone, whose predictions have no intervals; run a blend "
+                "(the folder of offbeat train)"
+            )
+        half[:, self._exogenous] = np.nan
+        return half
+
+    @property
+    def has_intervals(self) -> bool:
+        """Whether predictions have intervals."""
+        return self._engine.half_widths(np.zeros(0), 0.5) is not None
+
     def reset(self) -> None:
         """Resets the state. The counters keep their values."""
         self._placing.reset()

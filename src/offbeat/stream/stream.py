@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from offbeat.answers.blend import Blend
 from offbeat.config import check_seed
+from offbeat.data.scaler import Scaler
 from offbeat.models.base import BaseModel
 from offbeat.models.model import Model
+from offbeat.stream.blend_engine import BlendEngine
 from offbeat.stream.cpu_engine import CpuEngine
 from offbeat.stream.engine import Engine
 from offbeat.stream.live import LiveStream, StreamInfo
@@ -28,7 +31,8 @@ class Stream(LiveStream):
     again on its newest `window_rows` rows for each prediction.
 
     Args:
-        model: trained; its weights must not change.
+        model: trained, a model or a blend, whose predictions have intervals; its weights must not
+            change.
         options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns. Integers are exact.
         seed: of the generator of self-feeding.
@@ -45,7 +49,7 @@ class Stream(LiveStream):
 
     def __init__(
         self,
-        model: BaseModel,
+        model: BaseModel | Blend,
         options: StreamOptions | None = None,
         *,
         time_unit: str = "s",
@@ -53,6 +57,10 @@ class Stream(LiveStream):
         **fields: Any,
     ) -> None:
         chosen = with_options(options, fields)
+        if isinstance(model, Blend):
+            info, engine = of_blend(model, seed=check_seed(seed), window=chosen.window_rows)
+            super().__init__(engine, info, options=chosen, time_unit=time_unit)
+            return
         limit = float(model.config.gap_limit or 1) if isinstance(model, Model) else 1.0
         info = StreamInfo(
             names=model.names,
@@ -66,6 +74,31 @@ class Stream(LiveStream):
         window = chosen.window_rows or model.statistics.rows or 1
         engine = engine_of(model, seed=check_seed(seed), window=window)
         super().__init__(engine, info, options=chosen, time_unit=time_unit)
+
+
+def of_blend(blend: Blend, *, seed: int, window: int | None) -> tuple[StreamInfo, Engine]:
+    """What a stream needs of a blend, and the engine that runs it.
+
+    Args:
+        blend: fitted.
+        seed: of the generator of self-feeding.
+        window: rows that a model without a recurrent state is run on; None for those of training.
+    """
+    model, inner = blend.forward, None
+    gap, limit = blend.tasks.gap_s, 4.0 * float(blend.stack.keys.bins.edges[-1])
+    if model is not None:
+        inner = engine_of(model, seed=seed, window=window or model.statistics.rows or 1)
+        gap = model.statistics.median_gap
+    info = StreamInfo(
+        names=blend.names,
+        units=blend.units,
+        scaler=Scaler.identity(blend.channels),
+        median_gap=gap,
+        elapsed_limit=limit,
+        transforms=blend.transforms,
+        roles=blend.roles,
+    )
+    return info, BlendEngine(blend, inner)
 
 
 def engine_of(model: BaseModel, *, seed: int, window: int) -> Engine:

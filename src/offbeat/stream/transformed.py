@@ -148,6 +148,19 @@ class LiveTransforms:
             values[:, c] = values[:, source]
         return values
 
+    def undo_widths(self, widths: Values) -> Values:
+        """Half widths of the predictions that `undo` gives.
+
+        Args:
+            widths: (times, channels) in original units.
+        """
+        widths = widths.copy()
+        for c, _ in self._constants:
+            widths[:, c] = 0.0
+        for c, source in self._copies:
+            widths[:, c] = widths[:, source]
+        return widths
+
 
 class TransformedEngine(Engine):
     """Takes rows as sent, in original units, and predicts in the same convention.
@@ -193,6 +206,11 @@ class TransformedEngine(Engine):
         """(times, channels) in original units, in the convention of what was sent."""
         predicted = self._scaler.original(self._engine.predict(times))
         return self._live.undo(predicted, self._state)
+
+    def half_widths(self, times: NDArray[np.float64], level: float) -> NDArray[np.float64] | None:
+        """Those of the engine; 0 for channels that are given back as they were in training."""
+        widths = self._engine.half_widths(times, level)
+        return None if widths is None else self._live.undo_widths(widths)
 
     def save(self, slot: int) -> None:
         """Copies the state to a slot."""
