@@ -29,11 +29,20 @@ from offbeat.answers.both_sides import (
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
 from offbeat.baselines.base import Array
 from offbeat.baselines.history import typical_gap
-from offbeat.baselines.stack import Stack, errors_of, fit_stack, independent_tasks, kinds_of, within
+from offbeat.baselines.stack import (
+    LEVELS,
+    Stack,
+    errors_of,
+    fit_stack,
+    independent_tasks,
+    kinds_of,
+    within,
+)
 from offbeat.data.tasks import CAUSAL, TWO_SIDED, TaskConfig, draw_tasks
 from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
 from offbeat.models.base import BaseModel, of_channels
+from offbeat.tables import plain
 
 CAUSAL_MEMBERS = ("last_value", "constant_velocity", "damped_slope", "mean", "running_mean")
 """Causal baselines of a blend."""
@@ -208,6 +217,18 @@ class Blend:
             unit=unit,
             beyond=beyond,
         )
+
+    def gamma_table(self) -> str:
+        """A plain-text table of gamma per channel and time since observation, in motion as usual.
+
+        A value near 0 says that the model adds nothing to the baselines there.
+        """
+        edges = self.stack.keys.bins.edges
+        lines = [["gamma: channel", *(f"to {edge:.3g} s" for edge in edges)]]
+        usual = self.gamma[LEVELS - 1 :: LEVELS][: len(edges)]
+        for c, name in enumerate(self.names):
+            lines.append([name, *(f"{g:.2f}" for g in usual[:, c])])
+        return plain(lines)
 
     def arrays(self) -> dict[str, Array]:
         """All tables, by name; models are not among them."""

@@ -492,8 +492,10 @@ def _fills(
     return result, None, fillers()
 
 
-def training_mean(model: BaseModel) -> list[float]:
+def training_mean(model: BaseModel | Blend) -> list[float]:
     """The mean of each channel over the observed values of the training set, in its unit."""
+    if isinstance(model, Blend):
+        return [float(m) for m in model.stack.mean]
     mean: list[float] = model.scaler.original(np.array(model.statistics.mean)).tolist()
     return mean
 

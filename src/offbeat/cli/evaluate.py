@@ -60,9 +60,9 @@ def evaluate_command(
         seed: of the mask, and of models with self-feeding.
         json: print the scores as JSON.
     """
+    from offbeat.answers.blend import Blend
     from offbeat.answers.forecast import checked_horizons
-    from offbeat.answers.impute import load_run
-    from offbeat.answers.two_sided import TwoSided
+    from offbeat.answers.saved import load_run
     from offbeat.cli.scored import fill_figure, scored
     from offbeat.data.masking import mask_out
     from offbeat.data.redundant import leave_out_of
@@ -105,16 +105,16 @@ def evaluate_command(
                 burst_s=burst_s,
                 seed=seed,
             )
-    chosen = plotted_channels(forward.names, channels)
+    forward = loaded.forward if isinstance(loaded, Blend) else loaded
+    chosen = plotted_channels(loaded.names, channels)
     one_trajectory(dataset, trajectory)
-    evaluation = evaluate(forward, dataset, seed=seed)
+    evaluation = None if forward is None else evaluate(forward, dataset, seed=seed)
     scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)
     result = {"part": part, **scores}
     if out is not None:
         write_json(out, result)
-    heading = (
-        f"RMSE in scaled units ({evaluation.scaler}), part: {part}, {len(dataset)} trajectories"
-    )
+    scaler = "standard deviations" if evaluation is None else evaluation.scaler
+    heading = f"RMSE in scaled units ({scaler}), part: {part}, {len(dataset)} trajectories"
     if figure is not None:
         fill_figure(loaded, dataset, figure, chosen, trajectory, seed=seed)
         result["figure"] = str(figure)

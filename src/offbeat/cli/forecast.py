@@ -48,9 +48,9 @@ def forecast_command(
     import numpy as np
 
     from offbeat.answers.forecast import checked_horizons, forecast
+    from offbeat.answers.saved import load_run
     from offbeat.cli.scored import forecast_figure
     from offbeat.data.writers.tables import write_table
-    from offbeat.answers.saved import load_run
 
     if horizons is None:
         raise InputError(

@@ -46,8 +46,8 @@ def predict_command(
         json: print what was written as JSON.
     """
     from offbeat.answers.predict import predict
-    from offbeat.data.writers.tables import write_table
     from offbeat.answers.saved import load_run
+    from offbeat.data.writers.tables import write_table
 
     check_out(out, data)
     check_seed(seed)

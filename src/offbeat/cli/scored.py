@@ -10,12 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat import baselines
+from offbeat import baselines, tables
+from offbeat.answers.blend import TASKS, Blend, number_of_tasks
 from offbeat.answers.forecast import forecast
 from offbeat.answers.impute import impute
-from offbeat.answers.scoring import score_forecast, score_imputation, training_mean
+from offbeat.answers.scoring import (
+    ChannelScores,
+    score_forecast,
+    score_imputation,
+    score_one_step,
+    training_mean,
+)
 from offbeat.answers.two_sided import TwoSided
 from offbeat.data.masking import masked_values
+from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.evaluation import Evaluation
 from offbeat.models.base import BaseModel
@@ -24,9 +32,9 @@ from offbeat.plots.figures import save
 
 
 def scored(
-    model: BaseModel | TwoSided,
+    model: BaseModel | Blend | TwoSided,
     dataset: Dataset,
-    evaluation: Evaluation,
+    evaluation: Evaluation | None,
     *,
     horizons: Sequence[float] | None = None,
     seed: int = 0,
@@ -34,12 +42,15 @@ def scored(
     """All scores of a model on a data set, as JSON and as text.
 
     Args:
-        model: a trained model, or a pair.
+        model: a trained model, or a blend.
         dataset: its masked values, if any, are imputed and scored.
-        evaluation: its one-step-ahead scores.
-        horizons: s; None scores no forecasts.
+        evaluation: the model's one-step-ahead scores.
+        horizons: s; None scores no forecasts of a model, and those of a blend up to its horizon.
         seed: of models with self-feeding.
     """
+    if isinstance(model, Blend):
+        return _scored_blend(model, dataset, evaluation, horizons, seed)
+    assert evaluation is not None
     ahead = evaluation.in_units()
     result: dict[str, Any] = {**evaluation.to_dict(), "verdict": ahead.verdict()}
     text = [evaluation.table(), "", "one step ahead, RMSE in the channels' units:", ahead.table()]
@@ -49,11 +60,6 @@ def scored(
         result["imputation"] = imputed.to_dict()
         text += ["", "masked values filled, RMSE in the channels' units:", imputed.table()]
         verdicts.append(imputed.verdict())
-        if isinstance(model, TwoSided):
-            fractions = [f"{part:.2f} up to {end:.3g} s" for end, part in model.rule.model_fraction]
-            if fractions:
-                result["imputation"]["model_fraction"] = model.rule.model_fraction
-                text.append(f"weight of the models in the two-sided fill: {', '.join(fractions)}")
     if horizons is not None:
         forward = model.forward if isinstance(model, TwoSided) else model
         ahead_of = score_forecast(forward, dataset, horizons)
@@ -66,8 +72,77 @@ def scored(
     return result, "\n".join([*text, "", *verdicts])
 
 
+def _scored_blend(
+    blend: Blend,
+    dataset: Dataset,
+    evaluation: Evaluation | None,
+    horizons: Sequence[float] | None,
+    seed: int,
+) -> tuple[dict[str, Any], str]:
+    """All tasks of a blend, on the same values as its model and its baselines."""
+    tasks = [score_one_step(blend, dataset, seed=seed)]
+    masked = dataset
+    if not any(masked_values(t).any() for t in dataset):
+        count = number_of_tasks(dataset, blend.tasks, TASKS)
+        masked = draw_tasks(dataset, blend.tasks, count, shares=TWO_SIDED, seed=[seed, 2])
+    fills = [score_imputation(blend, masked, mode=m, seed=seed) for m in ("causal", "two_sided")]
+    tasks += [fill.scores for fill in fills]
+    after = horizons
+    if after is None:
+        longest = max(float(t.times[-1] - t.times[0]) for t in dataset)
+        after = [h for h in default_horizons(blend) if h < longest]
+    if len(after):
+        tasks += score_forecast(blend, dataset, after)
+    result: dict[str, Any] = {} if evaluation is None else evaluation.to_dict()
+    result["tasks"] = [scores.to_dict() for scores in tasks]
+    result["gamma"] = {
+        "edges_s": blend.stack.keys.bins.edges.tolist(),
+        "channels": dict(zip(blend.names, blend.gamma.T.tolist(), strict=True)),
+    }
+    text = [overview(tasks)]
+    for scores in tasks:
+        text += ["", f"{scores.task}, RMSE in the channels' units:", scores.short()]
+    if blend.forward is not None:
+        text += ["", "weight of the model in the answer, by time since observation:"]
+        text.append(blend.gamma_table())
+    return result, "\n".join([*text, "", *(scores.verdict() for scores in tasks)])
+
+
+def default_horizons(blend: Blend) -> list[float]:
+    """s, horizons at which a blend is scored: parts of the longest one that it was made for."""
+    return [float(f"{part * blend.tasks.horizon_s:.2g}") for part in (0.1, 0.2, 0.5, 1.0)]
+
+
+def overview(tasks: Sequence[ChannelScores]) -> str:
+    """A table with a row per task: scaled RMSE of the answer and of the best predictors.
+
+    Args:
+        tasks: scores whose first predictor is the blend.
+    """
+    lines = [
+        ["task, scaled RMSE", "blend", "model", "best baseline", "", "in 50, 80, 95 %", "CRPS"]
+    ]
+    for scores in tasks:
+        own, *others = scores.rmse
+        model = next((name for name in others if name not in scores.trivial), None)
+        best, who = min((scores.overall[p], p) for p in scores.trivial)
+        covered = scores.coverage or {}
+        lines.append(
+            [
+                scores.task,
+                f"{scores.overall[own]:.4g}",
+                "-" if model is None else f"{scores.overall[model]:.4g}",
+                f"{best:.4g}",
+                who,
+                " ".join(f"{100 * share:.0f}" for share in covered.values()),
+                "-" if scores.crps is None else f"{scores.crps:.3g}",
+            ]
+        )
+    return tables.plain(lines, left=(0, 4))
+
+
 def fill_figure(
-    model: BaseModel | TwoSided,
+    model: BaseModel | Blend | TwoSided,
     dataset: Dataset,
     path: Path,
     channels: Sequence[str],
@@ -80,7 +155,7 @@ def fill_figure(
     """Plots one trajectory: its masked values, the model's fill and interpolations.
 
     Args:
-        model: a trained model, or a pair.
+        model: a trained model, or a blend.
         dataset: its masked values are plotted as the truth.
         path: the figure.
         channels: to plot.
@@ -100,7 +175,7 @@ def fill_figure(
 
 
 def forecast_figure(
-    model: BaseModel,
+    model: BaseModel | Blend,
     dataset: Dataset,
     horizons: NDArray[np.float64],
     path: Path,
@@ -131,6 +206,6 @@ def forecast_figure(
     save(answers(end, drawn, channels, title=truth.origin), path)
 
 
-def _filled(trajectory: Trajectory, method: str, model: BaseModel) -> Trajectory:
+def _filled(trajectory: Trajectory, method: str, model: BaseModel | Blend) -> Trajectory:
     values = baselines.fill(trajectory, method, training_mean(model))
     return replace(trajectory, values=np.where(trajectory.observed, trajectory.values, values))

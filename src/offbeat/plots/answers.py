@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from offbeat.answers.answer import Answer
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Trajectory
 from offbeat.plots.figures import channel_panels
@@ -30,7 +31,7 @@ def answers(
     """Draws channels over time: observed values, masked values, and the predictions of both.
 
     A predictor is drawn where its `observed` is False; its values where something was measured
-    are not drawn. Lines break at observed values.
+    are not drawn. Lines break at observed values. Answers with intervals have a band of 90 %.
 
     Args:
         truth: observed values are black, known and masked values are hollow.
@@ -54,6 +55,19 @@ def _channel(axes: Axes, truth: Trajectory, answered: Mapping[str, Trajectory], 
         at, style = trajectory.names.index(name), style_of(model)
         times, values = _with_ends(trajectory, at, truth, channel)
         drawn.append(trajectory.values[~trajectory.observed[:, at], at])
+        if isinstance(trajectory, Answer) and trajectory.widths is not None:
+            low, high = (end[:, at] for end in trajectory.interval(0.9))
+            hidden = ~trajectory.observed[:, at]
+            drawn += [low[hidden], high[hidden]]
+            axes.fill_between(
+                trajectory.times,
+                np.where(hidden, low, np.nan),
+                np.where(hidden, high, np.nan),
+                color=style.colour,
+                alpha=0.18,
+                linewidth=0,
+                zorder=1,
+            )
         axes.plot(
             times,
             values,
