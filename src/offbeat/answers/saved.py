@@ -116,7 +116,7 @@ def load_blend(path: str | Path) -> Blend:
         ) from None
 
 
-def load_run(path: str | Path) -> BaseModel | Blend:
+def load_run(path: str | Path) -> Any:
     """Reads the blend of a folder, or its model where there is no blend.
 
     Args:
@@ -125,7 +125,9 @@ def load_run(path: str | Path) -> BaseModel | Blend:
     Raises:
         FileFormatError: as `load_model` and `load_blend`.
     """
-    return load_blend(path) if (Path(path) / CONFIG).is_file() else load_model(path)
+    from offbeat.answers import impute
+
+    return load_blend(path) if (Path(path) / CONFIG).is_file() else impute.load_run(path)
 
 
 def _tasks(record: dict[str, Any]) -> TaskConfig:
