@@ -297,7 +297,7 @@ def load_two_sided(path: str | Path) -> TwoSided:
         ) from None
 
 
-def load_run(path: str | Path) -> BaseModel | TwoSided:
+def load_run(path: str | Path) -> BaseModel | Blend | TwoSided:
     """Reads the model of a folder, or the pair where the run is two-sided.
 
     Args:
@@ -306,5 +306,7 @@ def load_run(path: str | Path) -> BaseModel | TwoSided:
     Raises:
         FileFormatError: as `load_model` and `load_two_sided`.
     """
+    from offbeat.answers.saved import load_predictor
+
     two_sided = (Path(path) / RULE_FILE).is_file()
-    return load_two_sided(path) if two_sided else load_model(path)
+    return load_two_sided(path) if two_sided else load_predictor(path)

@@ -116,7 +116,7 @@ def load_blend(path: str | Path) -> Blend:
         ) from None
 
 
-def load_run(path: str | Path) -> Any:
+def load_predictor(path: str | Path) -> BaseModel | Blend:
     """Reads the blend of a folder, or its model where there is no blend.
 
     Args:
@@ -125,9 +125,7 @@ def load_run(path: str | Path) -> Any:
     Raises:
         FileFormatError: as `load_model` and `load_blend`.
     """
-    from offbeat.answers import impute
-
-    return load_blend(path) if (Path(path) / CONFIG).is_file() else impute.load_run(path)
+    return load_blend(path) if (Path(path) / CONFIG).is_file() else load_model(path)
 
 
 def _tasks(record: dict[str, Any]) -> TaskConfig:

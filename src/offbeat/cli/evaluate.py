@@ -62,13 +62,14 @@ def evaluate_command(
     """
     from offbeat.answers.blend import Blend
     from offbeat.answers.forecast import checked_horizons
-    from offbeat.answers.saved import load_run
+    from offbeat.answers.impute import load_run
     from offbeat.cli.scored import fill_figure, scored
     from offbeat.data.masking import mask_out
     from offbeat.data.redundant import leave_out_of
     from offbeat.data.splits import load_split
     from offbeat.evaluation import evaluate
     from offbeat.files import write_json
+    from offbeat.models.base import BaseModel
 
     if part is not None:
         one_of("part", part, ("train", "validation", "test", "all"))
@@ -105,8 +106,15 @@ def evaluate_command(
                 burst_s=burst_s,
                 seed=seed,
             )
-    forward = loaded.forward if isinstance(loaded, Blend) else loaded
-    chosen = plotted_channels(loaded.names, channels)
+    forward = loaded if isinstance(loaded, BaseModel) else loaded.forward
+    names = (
+        loaded.names
+        if isinstance(loaded, Blend)
+        else loaded.forward.names
+        if not isinstance(loaded, BaseModel)
+        else loaded.names
+    )
+    chosen = plotted_channels(names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = None if forward is None else evaluate(forward, dataset, seed=seed)
     scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)
