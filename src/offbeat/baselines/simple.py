@@ -17,7 +17,7 @@ from offbeat.baselines.base import (
     stepped,
 )
 from offbeat.baselines.history import AgeBins, History
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import Dataset, Trajectory
 
 
 class LastValue(CausalBaseline):
@@ -129,7 +129,7 @@ class Linear(Baseline):
 
     def predict(self, dataset: Dataset) -> list[Array]:
         """See `Baseline`. At an observed row, the line between its neighbours."""
-        return [_each_channel(t, self.mean, np.interp) for t in dataset]
+        return [_each_mask(t, self.mean, _line) for t in dataset]
 
 
 class Pchip(Baseline):
@@ -142,25 +142,37 @@ class Pchip(Baseline):
 
     def predict(self, dataset: Dataset) -> list[Array]:
         """See `Baseline`. At an observed row, the observed value itself."""
-        return [_each_channel(t, self.mean, _pchip) for t in dataset]
+        return [_each_mask(t, self.mean, _pchip) for t in dataset]
 
 
-def _each_channel(trajectory: Any, mean: Array, curve: Any) -> Array:
+def _each_mask(trajectory: Trajectory, mean: Array, curve: Any) -> Array:
+    """Interpolates the channels that are observed in the same rows together."""
     predicted = np.empty((trajectory.rows, trajectory.channels))
-    for c in range(trajectory.channels):
-        seen = np.flatnonzero(trajectory.observed[:, c])
-        predicted[:, c] = mean[c]
+    observed = trajectory.observed
+    _, group = np.unique(np.packbits(observed, axis=0), axis=1, return_inverse=True)
+    for g in range(group.max() + 1):
+        at = np.flatnonzero(group == g)
+        seen = np.flatnonzero(observed[:, at[0]])
+        predicted[:, at] = mean[at]
         if len(seen):
-            times = trajectory.times[seen]
-            predicted[:, c] = curve(trajectory.times, times, trajectory.values[seen, c])
+            values = trajectory.values[np.ix_(seen, at)]
+            predicted[:, at] = curve(trajectory.times, trajectory.times[seen], values)
     return predicted
+
+
+def _line(at: Array, times: Array, values: Array) -> Array:
+    if len(times) < 2:
+        return np.repeat(values, len(at), axis=0)
+    start = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    part = np.clip((at - times[start]) / (times[start + 1] - times[start]), 0.0, 1.0)[:, None]
+    return np.asarray((1 - part) * values[start] + part * values[start + 1])
 
 
 def _pchip(at: Array, times: Array, values: Array) -> Array:
     from scipy.interpolate import PchipInterpolator
 
     if len(times) < 2:
-        return np.full(len(at), values[0])
+        return np.repeat(values, len(at), axis=0)
     curve = PchipInterpolator(times - times[0], values)
     return np.asarray(curve(np.clip(at, times[0], times[-1]) - times[0]), dtype=np.float64)
 

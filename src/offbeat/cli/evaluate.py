@@ -78,9 +78,10 @@ def evaluate_command(
     check_figure(figure)
     after = None if horizons is None else checked_horizons(horizons).tolist()
     loaded = load_run(model)
-    forward = loaded.forward if isinstance(loaded, TwoSided) else loaded
+    forward = loaded if isinstance(loaded, BaseModel) else loaded.forward
+    made = loaded if isinstance(loaded, BaseModel | Blend) else loaded.forward
     # As in training, where these channels were not masked.
-    dataset = leave_out_of(read_log(data, reader, run=model), forward.transforms)
+    dataset = leave_out_of(read_log(data, reader, run=model), made.transforms)
     own = load_split(model / "split.json", dataset)
     if own is None and part not in (None, "all"):
         raise InputError(
@@ -106,15 +107,7 @@ def evaluate_command(
                 burst_s=burst_s,
                 seed=seed,
             )
-    forward = loaded if isinstance(loaded, BaseModel) else loaded.forward
-    names = (
-        loaded.names
-        if isinstance(loaded, Blend)
-        else loaded.forward.names
-        if not isinstance(loaded, BaseModel)
-        else loaded.names
-    )
-    chosen = plotted_channels(names, channels)
+    chosen = plotted_channels(made.names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = None if forward is None else evaluate(forward, dataset, seed=seed)
     scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)
