@@ -186,6 +186,25 @@ def test_motion_that_ends_half_way_is_in_every_part():
     assert in_time.split == SplitConfig(by="time", window_s=1.0), "a split that is given is kept"
 
 
+@pytest.mark.parametrize("start", [3, 20, 37, 50])
+def test_a_single_manoeuvre_is_in_the_training_part_and_in_validation_where_it_can_be(start):
+    times = at(50, 60)
+    moving = (times >= start) & (times < start + 4)
+    values = np.where(moving[:, None], motion(times), 0.0)
+    values += 0.002 * np.random.default_rng(0).normal(size=values.shape)
+    dataset = log(times, values)
+    chosen = plan(dataset)
+    whole = SplitConfig(
+        by="blocks", blocks=chosen.split.blocks, gap_s=chosen.split.gap_s, seed=chosen.split.seed
+    )
+    rows = [sum(int((np.abs(t.values) > 0.1).any(axis=1).sum()) for t in part)
+            for part in ob.apply_split(dataset, whole)]  # fmt: skip
+    assert rows[0] > 40, "moving rows of the training part"
+    lacking = [i for i in (1, 2) if rows[i] < 5]
+    said = [note for note in chosen.notes if "is at rest" in note]
+    assert len(said) >= len(lacking), "what is missing is said"
+
+
 def test_a_channel_that_the_training_part_lacks_is_said_and_left_out():
     times = at(50, 60)
     values = motion(times)

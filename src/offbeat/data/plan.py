@@ -15,10 +15,10 @@ from offbeat.data.cleaning.log import listed
 from offbeat.data.inspection import without_repeats
 from offbeat.data.outliers import mask_outliers
 from offbeat.data.redundant import Redundant, find_redundant, leave_out
-from offbeat.data.representative import differences
+from offbeat.data.representative import differences, unlikeness
 from offbeat.data.scaler import clipped
 from offbeat.data.splits import apply_split
-from offbeat.data.trajectory import STATE, Dataset
+from offbeat.data.trajectory import STATE, Dataset, known_values
 from offbeat.data.transforms import Angle, Transforms, full_turn, is_angle_unit, lowest_of
 from offbeat.errors import InputError
 
@@ -35,6 +35,7 @@ _SILENCE = 3.0  # median steps of a sensor
 _MOST_BLOCKS, _BLOCK_ROWS = 5, 20
 _SAME_SENSOR = 0.9  # of the rows in which one of two channels reports, those in which both do
 _SAMPLE = 20_000  # rows
+_MOST_TRIES, _COMPARED = 24, 20_000_000  # splits that are compared, and values in all of them
 
 Values = NDArray[np.float64]
 
@@ -93,7 +94,8 @@ def plan(
             and masks are taken as they are.
         horizon_s: s, longest forecast to train for; by default found from the log.
         split: to be used as it is; by default chosen.
-        seed: of the split that is chosen.
+        seed: of the split that is chosen; of a split in blocks, others are tried from there, and
+            the one whose parts are most alike is taken.
 
     Returns:
         The choices. `prepare` applies those of the cleaning.
@@ -118,7 +120,10 @@ def plan(
     times = _Times.of(clean)
     horizon, why = _horizon(clean, times, horizon_s)
     window, found, for_split = _split(clean, times, horizon, seed)
-    split, for_split = (found, for_split) if split is None else (split, [])
+    if split is None:
+        split = found = _most_alike(clean, found)
+    else:
+        for_split = []
     never = _never_trained(clean, split)
     if never:
         redundant = replace(redundant, empty=(*redundant.empty, *never))
@@ -179,7 +184,7 @@ def cleaned(dataset: Dataset, options: Mapping[str, Any]) -> Dataset:
         if name in dataset.names:
             c = dataset.names.index(name)
             period = full_turn(dataset.units[c])
-            values = np.concatenate([t.values[t.known[:, c], c] for t in dataset])
+            values = np.concatenate([known_values(t, c) for t in dataset])
             angles[name] = Angle(period, lowest_of(values.min(), values.max(), period))
     return Transforms(angles).apply(dataset) if angles else dataset
 
@@ -230,7 +235,7 @@ def find_wrapping(dataset: Dataset) -> list[str]:
         if not is_angle_unit(unit):
             continue
         turn = full_turn(unit)
-        columns = [t.values[t.known[:, c], c] for t in dataset]
+        columns = [known_values(t, c) for t in dataset]
         values = np.concatenate(columns)
         steps = np.concatenate([np.abs(np.diff(column)) for column in columns])
         if not len(steps) or lowest_of(values.min(), values.max(), turn) is None:
@@ -341,14 +346,14 @@ class _Times:
 
 def _horizon(dataset: Dataset, times: _Times, asked: float | None) -> tuple[float, str]:
     several = len(dataset) >= _FEWEST_EPISODES
-    longest = (times.episode if several else 0.15 * times.total) / 4
+    longest = (times.episode if several else 0.15 * times.total) / 4.4
     if asked is not None:
         said = f"forecasts up to {asked:g} s, as asked for"
         if asked > longest:
             said += f"; the log is too short to judge them at more than {longest:.2g} s"
         return asked, said
-    motion = _motion_s(dataset)
     most = max(_LONGEST_HORIZON_S, _SHORT_STEPS * times.gap)
+    motion = _motion_s(dataset, most)
     found = max(motion, times.silence, 2 * times.slowest, _FEWEST_STEPS * times.gap)
     horizon = max(min(found, most, longest), times.gap)
     because = {
@@ -362,10 +367,10 @@ def _horizon(dataset: Dataset, times: _Times, asked: float | None) -> tuple[floa
     return horizon, f"forecasts up to {horizon:g} s ({because}); --horizon_s asks for another time"
 
 
-def _motion_s(dataset: Dataset) -> float:
+def _motion_s(dataset: Dataset, most: float) -> float:
     """Twice the time after which the correlation of a state with itself is 0.5, the median one.
 
-    That is where the mean squared change reaches the variance.
+    That is where the mean squared change reaches the variance. Above `most`, it is not exact.
     """
     found = []
     for c, role in enumerate(dataset.roles):
@@ -379,13 +384,13 @@ def _motion_s(dataset: Dataset) -> float:
         inner = clipped(values)
         variance, low, high = float(inner.var()), float(inner.min()), float(inner.max())
         columns = [np.clip(column, low, high) for column in columns]
-        longest, lag = max(len(column) for column in columns), 1
-        while lag < longest / 3:
+        longest, lag, step = max(len(column) for column in columns), 1, float(np.median(steps))
+        while lag < longest / 3 and 2 * lag * step <= most:
             changes = [column[lag:] - column[:-lag] for column in columns if len(column) > lag]
             if np.square(np.concatenate(changes)).mean() >= variance:
                 break
             lag = max(lag + 1, int(1.3 * lag))
-        found.append(2 * lag * float(np.median(steps)))
+        found.append(2 * lag * step)
     return float(np.median(found)) if found else 0.0
 
 
@@ -435,6 +440,30 @@ def _mask(dataset: Dataset, times: _Times, horizon: float) -> dict[str, Any]:
     if times.silence:
         return {"observed_fraction": 0.7, "mask": "bursts", "burst_s": length}
     return {"observed_fraction": 0.7}
+
+
+def _most_alike(dataset: Dataset, split: SplitConfig) -> SplitConfig:
+    """The split in blocks, of several with other seeds, whose parts differ least.
+
+    What a log has once, such as a single manoeuvre in a long rest, belongs into the training part
+    and, where it can be, into the others.
+    """
+    if split.by != "blocks":
+        return split
+    values = sum(t.rows for t in dataset) * dataset.channels
+    tries = min(max(_COMPARED // values, 4), _MOST_TRIES)
+    best, least = split, None
+    for k in range(tries):
+        tried = replace(split, seed=(split.seed + 1000 * k) % 2**32)
+        try:
+            unlike = unlikeness(*apply_split(dataset, _whole(tried)))
+        except InputError:  # a part is empty
+            continue
+        if least is None or unlike < least:
+            best, least = tried, unlike
+        if not unlike:
+            break
+    return best
 
 
 def _whole(split: SplitConfig) -> SplitConfig:

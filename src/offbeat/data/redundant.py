@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.log import listed
-from offbeat.data.trajectory import ACTION, EXOGENOUS, STATE, Dataset
+from offbeat.data.trajectory import ACTION, EXOGENOUS, STATE, Dataset, known_values
 from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError
 
@@ -74,7 +74,7 @@ def find_redundant(dataset: Dataset) -> Redundant:
     for c, (name, role) in enumerate(zip(dataset.names, dataset.roles, strict=True)):
         if role == ACTION:
             continue
-        known = [t.values[t.known[:, c], c] for t in dataset]
+        known = [known_values(t, c) for t in dataset]
         values = np.concatenate(known)
         if not len(values):
             empty.append(name)
@@ -161,7 +161,7 @@ def _counts(known: list[NDArray[np.float64]]) -> bool:
 def _tells_time(dataset: Dataset, c: int) -> bool:
     """Whether the values are the time of their rows, in some unit, up to half a typical step."""
     for t in dataset:
-        known = t.known[:, c]
+        known = ~np.isnan(t.values[:, c])
         times, values = t.times[known], t.values[known, c]
         if len(times) < _FEWEST or values[-1] <= values[0]:
             return False
@@ -175,7 +175,7 @@ def _same_times(dataset: Dataset, one: int, other: int) -> bool:
     """Whether two channels with the same values have them at about the same times."""
     distinct: set[float] = set()
     for t in dataset:
-        a, b = t.known[:, one], t.known[:, other]
+        a, b = ~np.isnan(t.values[:, one]), ~np.isnan(t.values[:, other])
         if a.sum() != b.sum() or not np.array_equal(t.values[a, one], t.values[b, other]):
             return False
         times = t.times[a]

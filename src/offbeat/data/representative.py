@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.log import listed
 from offbeat.data.scaler import clipped
-from offbeat.data.trajectory import STATE, Dataset
+from offbeat.data.trajectory import STATE, Dataset, known_values
 
 _FEWEST = 20  # values of a channel that are compared
 _LAG = 10  # values, over which motion is measured
@@ -38,23 +38,44 @@ def differences(train: Dataset, validation: Dataset, test: Dataset) -> tuple[str
         validation: the validation part.
         test: the test part.
     """
-    channels = [c for c, role in enumerate(train.roles) if role == STATE]
-    columns = {c: _columns(train, c) for c in channels}
     notes: list[str] = []
     for name, part in (("validation", validation), ("test", test)):
-        found: dict[str, list[str]] = {}
-        compared = 0
-        for c in channels:
-            kind = _difference(columns[c], _columns(part, c))
-            compared += kind is not None
-            if kind:
-                found.setdefault(kind, []).append(train.names[c])
-        notes += _sentences(name, found, compared)
+        notes += _sentences(name, *_compared(train, part))
     return tuple(notes)
 
 
+def unlikeness(train: Dataset, validation: Dataset, test: Dataset) -> int:
+    """A count of the differences; twice where the training part lacks what another one has.
+
+    Args:
+        train: the training part.
+        validation: the validation part.
+        test: the test part.
+    """
+    weights = {"range": 2, "more motion": 2, "more spread": 2, "less motion": 1, "less spread": 1}
+    return sum(
+        weights[kind] * len(names)
+        for part in (validation, test)
+        for kind, names in _compared(train, part)[0].items()
+    )
+
+
+def _compared(train: Dataset, part: Dataset) -> tuple[dict[str, list[str]], int]:
+    """The states that differ, by kind, and the number of those compared."""
+    found: dict[str, list[str]] = {}
+    compared = 0
+    for c, role in enumerate(train.roles):
+        if role != STATE:
+            continue
+        kind = _difference(_columns(train, c), _columns(part, c))
+        compared += kind is not None
+        if kind:
+            found.setdefault(kind, []).append(train.names[c])
+    return found, compared
+
+
 def _columns(dataset: Dataset, c: int) -> list[Values]:
-    return [t.values[t.known[:, c], c] for t in dataset]
+    return [known_values(t, c) for t in dataset]
 
 
 def _difference(own: Sequence[Values], other: Sequence[Values]) -> str | None:

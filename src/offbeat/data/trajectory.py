@@ -384,6 +384,17 @@ class Dataset(Sequence[Trajectory]):
         )
 
 
+def known_values(trajectory: Trajectory, channel: int) -> NDArray[np.float64]:
+    """(known,) the known values of one channel, in the order of time.
+
+    Args:
+        trajectory: any.
+        channel: its position.
+    """
+    column = trajectory.values[:, channel]
+    return column[~np.isnan(column)]
+
+
 def _channels(trajectory: Trajectory) -> tuple[tuple[str, ...], ...]:
     return trajectory.names, trajectory.units, trajectory.roles
 
