@@ -1,0 +1,228 @@
+"""Tables of results as Markdown, between the markers of a document."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from offbeat.errors import InputError
+
+from .predictors import ORACLE, ORACLE_TWO_SIDED
+from .results import Summary
+from .scores import Against
+
+
+def document(text: str, name: str, body: str) -> str:
+    """Puts a body between the markers `<!-- NAME -->` and `<!-- end of NAME -->` of a text.
+
+    Args:
+        text: with both markers.
+        name: of the markers.
+        body: replaces what is between them.
+
+    Raises:
+        InputError: a marker is missing.
+    """
+    start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    before, found, rest = text.partition(start)
+    _, closed, after = rest.partition(end)
+    if not found or not closed:
+        raise InputError(f"the document has no {start} followed by {end}; add both")
+    return f"{before}{start}\n\n{body.strip()}\n\n{end}{after}"
+
+
+def tables(summary: Summary, *, every: bool = False) -> str:
+    """The tables of a log: errors, comparisons and intervals of each test part.
+
+    Args:
+        summary: of the log.
+        every: also the errors in units, per group of channels.
+    """
+    parts = []
+    for test in summary.tests:
+        title = f"{test.capitalize()}: " if len(summary.tests) > 1 else ""
+        parts += [f"{title}RMSE, scaled", errors(summary, test)]
+        if every:
+            parts += [f"{title}RMSE in units", groups(summary, test)]
+        parts += [
+            f"{title}wins / ties / losses",
+            comparisons(summary, test, list(summary.predictors) if every else shown(summary, test)),
+        ]
+        if calibrated := intervals(summary, test):
+            parts += [f"{title}coverage of 50 / 80 / 95 % intervals; CRPS, scaled", calibrated]
+    return "\n\n".join(parts)
+
+
+def errors(summary: Summary, test: str) -> str:
+    """A row per predictor and a column per task: RMSE, scaled; the best in bold, and its groups."""
+    asked = summary.tasks(test)
+    rows = [["values", *(str(int(summary.counts(test, task).sum())) for task in asked)]]
+    best = {
+        (task, causal): min(
+            (
+                _mean(summary.scaled(test, task, name))
+                for name in summary.predictors
+                if summary.causal(name) == causal and summary.scaled(test, task, name)
+            ),
+            default=np.nan,
+        )
+        for task in asked
+        for causal in (True, False)
+    }
+    for name in summary.predictors:
+        row = [_label(summary, name)]
+        for task in asked:
+            each = summary.scaled(test, task, name)
+            cell = _spread(each)
+            if each and _mean(each) == best[task, summary.causal(name)]:
+                cell = f"**{cell}**"
+            row.append(cell)
+        rows.append(row)
+    return _table(["", *asked], rows)
+
+
+def groups(summary: Summary, test: str) -> str:
+    """As `errors`, in the units of groups of channels: a row per group and predictor."""
+    asked = summary.tasks(test)
+    rows = []
+    for group in summary.head["groups"]:
+        for name in summary.predictors:
+            row = [group, _label(summary, name)]
+            for task in asked:
+                there = bool(summary.scaled(test, task, name))
+                value = summary.grouped(test, task, name)[group] if there else np.nan
+                row.append(_number(value))
+            rows.append(row)
+    return _table(["", "", *asked], rows)
+
+
+KINDS = ("one step", "fill", "forecast")
+"""First words of the names of tasks."""
+
+PRODUCT = "offbeat"
+"""Names of the predictors that are not baselines start with it."""
+
+
+def shown(summary: Summary, test: str) -> list[str]:
+    """Offbeat's predictors, and the best baseline with each of both kinds of input."""
+    names = []
+    for causal in (True, False):
+        same = [n for n in summary.predictors if summary.causal(n) == causal]
+        means = {
+            name: total.geometric_mean
+            for name in same
+            if not name.startswith(PRODUCT)
+            for total in [against(summary, test, name, simple=True)[1]]
+            if total
+        }
+        names += [min(means, key=lambda name: means[name])] if means else []
+        names += [name for name in same if name.startswith(PRODUCT)]
+    return names
+
+
+def against(
+    summary: Summary, test: str, name: str, *, simple: bool
+) -> tuple[list[Against | None], Against | None]:
+    """A predictor against the best of others per channel and task, in hindsight on the test.
+
+    Args:
+        summary: of the log.
+        test: name of the test part.
+        name: of the predictor.
+        simple: against `ORACLE` or `ORACLE_TWO_SIDED`, else against all baselines.
+
+    Returns:
+        By kind of task in the order of `KINDS`, and over all; None where nothing can be compared.
+    """
+    causal = summary.causal(name)
+    if simple:
+        others = list(ORACLE if causal else ORACLE_TWO_SIDED)
+    else:
+        baselines = [n for n in summary.predictors if not n.startswith(PRODUCT)]
+        others = [n for n in baselines if summary.causal(n) or not causal]
+    ratios = {task: summary.ratios(test, task, name, others) for task in summary.tasks(test)}
+    found = [
+        np.concatenate([np.empty(0), *(r for task, r in ratios.items() if task.startswith(kind))])
+        for kind in KINDS
+    ]
+    every = np.concatenate(found)
+    by_kind = [Against.of(each) if len(each) else None for each in found]
+    return by_kind, Against.of(every) if len(every) else None
+
+
+def comparisons(summary: Summary, test: str, names: Sequence[str]) -> str:
+    """Predictors against the best simple one, and against the best baseline.
+
+    Args:
+        summary: of the log.
+        test: name of the test part.
+        names: of the predictors.
+    """
+    there = [any(task.startswith(kind) for task in summary.tasks(test)) for kind in KINDS]
+    rows = []
+    for simple in (True, False):
+        for name in names:
+            by_kind, total = against(summary, test, name, simple=simple)
+            if total is None:
+                continue
+            cells = [
+                f"{each.wins} / {each.ties} / {each.losses}" if each else "" for each in by_kind
+            ]
+            rows.append(
+                [
+                    _label(summary, name),
+                    "simple" if simple else "baseline",
+                    *(cell for cell, kind in zip(cells, there, strict=True) if kind),
+                    _number(total.worst),
+                    _number(total.geometric_mean),
+                ]
+            )
+    kinds = [kind for kind, asked in zip(KINDS, there, strict=True) if asked]
+    return _table(["", "against the best", *kinds, "worst ratio", "geometric mean"], rows)
+
+
+def intervals(summary: Summary, test: str) -> str:
+    """Coverage of 50, 80 and 95 % intervals, in percent, and CRPS, per task; empty without them."""
+    rows = []
+    for name in summary.predictors:
+        each = [summary.intervals(test, task, name) for task in summary.tasks(test)]
+        if any(each):
+            rows.append([_label(summary, name), *map(_calibration, each)])
+    return _table(["", *summary.tasks(test)], rows) if rows else ""
+
+
+def _calibration(found: tuple[dict[str, float], float] | None) -> str:
+    if found is None:
+        return ""
+    coverage, crps = found
+    return f"{' / '.join(f'{100 * c:.0f}' for c in coverage.values())}; {_number(crps)}"
+
+
+def _label(summary: Summary, name: str) -> str:
+    words = name.removesuffix("_two_sided").replace("_", " ")
+    for word, proper in (("pchip", "PCHIP"), ("offbeat", "Offbeat"), ("kalman", "Kalman")):
+        words = words.replace(word, proper)
+    return words if summary.causal(name) else f"{words} (both sides)"
+
+
+def _mean(each: Sequence[float]) -> float:
+    return float(np.mean(each))
+
+
+def _spread(each: Sequence[float]) -> str:
+    """Mean, and half of the range where there are several."""
+    if not each:
+        return ""
+    half = (max(each) - min(each)) / 2
+    shown = _number(_mean(each))
+    return shown if len(each) == 1 else f"{shown} ± {half:.1g}"
+
+
+def _number(value: float) -> str:
+    return "" if value != value else f"{value:.3g}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
