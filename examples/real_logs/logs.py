@@ -358,7 +358,7 @@ def arm(quick: bool) -> Log:
         epochs=20,
         batch_size=6,
         drawn_tasks=20 if quick else 120,
-        targets=60,
+        targets=24,
     )
 
 
