@@ -30,6 +30,7 @@ STAGES = (
     "examples",
     "run",
     "training",
+    "ladder",
     "answers",
     "evaluation",
     "stream",
