@@ -50,6 +50,14 @@ def refused(path, message, error=FileFormatError, **options):
     assert "\n" not in str(caught.value)
 
 
+def first_record(mcap, code):
+    """Start and end of the content of the first record of a kind."""
+    at = 8
+    while mcap[at : at + 1] != code:
+        at += 9 + int.from_bytes(mcap[at + 1 : at + 9], "little")
+    return at + 9, at + 9 + int.from_bytes(mcap[at + 1 : at + 9], "little")
+
+
 def poses(store, n, *, topic="/pose", start=5 * S, late=3_000_000):
     rng = np.random.default_rng(n)
     numbers = rng.normal(size=(n, 7))
@@ -317,7 +325,30 @@ class TestDamage:
         whole = path.read_bytes()
         for length in (1, 14, 200, len(whole) // 2, len(whole) - 10):
             path.write_bytes(whole[:length])
+            if kind == "mcap" and length == len(whole) - 10:  # without the end of its index
+                dataset = read(path)
+                assert sum(t.rows for t in dataset) == 300
+                assert "a.mcap is cut off" in dataset.meta["cleaning"]["notes"][0]
+                continue
             refused(path, "can't be read|does not fit|cut short")
+
+    def test_an_mcap_that_is_cut_off_is_read_up_to_there(self, tmp_path):
+        folder = logs.write_bag2(tmp_path / "a", poses(logs.ROS2, 300)[2], mcap=True)
+        path = folder / "a.mcap"
+        whole = path.read_bytes()
+        end = first_record(whole, b"\x06")[1]  # of the only chunk
+        path.write_bytes(whole[:end])
+        assert sum(t.rows for t in read(path)) == 300
+        path.write_bytes(whole[: end // 2])
+        refused(path, "it is cut off before any topic")
+
+    def test_a_chunk_of_mcap_whose_checksum_does_not_match_is_refused(self, tmp_path):
+        folder = logs.write_bag2(tmp_path / "a", poses(logs.ROS2, 300)[2], mcap=True)
+        path = folder / "a.mcap"
+        raw = bytearray(path.read_bytes())
+        raw[first_record(raw, b"\x06")[0] + 24] ^= 1  # of its checksum
+        path.write_bytes(raw)
+        refused(path, "checksum of a chunk does not match")
 
     def test_a_bag_whose_recording_was_cut_off_says_how_to_repair_it(self, tmp_path):
         path = logs.write_bag1(tmp_path / "a.bag", poses(logs.ROS1, 3)[2])

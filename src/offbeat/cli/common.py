@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from offbeat.data.source import read_json
 from offbeat.errors import FileFormatError, InputError, one_of, printable
 
 if TYPE_CHECKING:
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 
 READER_FILE = "reader.json"
 """File in a run's folder with the options that its log was read with."""
+
+FOUND = "found"
+"""Key in that file of options that nothing stated, such as the unit of time found from the numbers.
+
+Other logs are read with them where nothing states these options there, either."""
 
 
 def say(result: Any, text: str, as_json: bool) -> None:
@@ -49,7 +55,21 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
     """
     from offbeat.data.readers import read
 
-    return read(data, **reader_options(reader, run))
+    options = reader_options(reader, run)
+    found = options.pop(FOUND, None)
+    dataset = read(data, **options)
+    if not isinstance(found, dict) or "found" not in dataset.meta:
+        return dataset
+    # Nothing in the log states its unit of time, or of an angle: they are those of the run.
+    own = dataset.meta["found"]
+    other = {}
+    if found.get("time_unit", own.get("time_unit")) != own.get("time_unit"):
+        other["time_unit"] = found["time_unit"]
+    wrong = [n for n, unit in own.get("units", {}).items() if unit != "deg"]
+    degrees = {n: "deg" for n in wrong if found.get("units", {}).get(n) == "deg"}
+    if degrees:
+        other["units"] = {**(options.get("units") or {}), **degrees}
+    return read(data, **{**options, **other}) if other else dataset
 
 
 def read_planned(
@@ -104,7 +124,7 @@ def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str,
     if "format" in given or run is None or not (run / READER_FILE).is_file():
         return given
     try:
-        kept = dict(json.loads((run / READER_FILE).read_text(encoding="utf-8")))
+        kept = dict(read_json(run / READER_FILE))
     except (TypeError, ValueError) as error:
         raise FileFormatError(
             f"{run / READER_FILE} is damaged ({error}); give --reader.format and other options"

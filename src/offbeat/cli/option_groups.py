@@ -6,7 +6,7 @@ import inspect
 import re
 import typing
 from dataclasses import fields
-from typing import Any
+from typing import Any, Literal
 
 from offbeat.cli.parser import Option
 from offbeat.config import TrainConfig
@@ -23,6 +23,11 @@ def reader_options() -> list[Option]:
     from offbeat.data.recording import ReaderOptions
 
     options = {"format": Option("format", str, "name of the format; by default found in the file")}
+    options["files"] = Option(
+        "files",
+        Literal["auto", "episodes", "merge"],
+        "of a folder of files, each holds episodes, or a sensor of one recording",
+    )
     options |= {option.name: option for option in _fields(ReaderOptions)}
     formats: dict[str, list[str]] = {}
     for reader in READERS.values():

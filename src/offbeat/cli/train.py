@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from offbeat.cli.common import READER_FILE, plain, read_planned, say
+from offbeat.cli.common import FOUND, READER_FILE, plain, read_planned, say
 from offbeat.config import ModelConfig, SplitConfig, check_seed
 from offbeat.errors import InputError, one_of
 
@@ -127,8 +127,9 @@ def train_command(
         fitted = fit(made, train_part, validation, config, out=out, device=device)
     write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
     save_split(out / "split.json", split, dataset)
-    if reader:
-        write_json(out / READER_FILE, reader)
+    if reader or "found" in dataset.meta:
+        kept = {**(reader or {}), FOUND: dataset.meta.get("found", {})}
+        write_json(out / READER_FILE, kept)
     evaluation = evaluate(made, test)
     scores, text = scored(trained, test, evaluation)
     result = {"steps": fitted.steps, "part": "test", **scores}

@@ -63,10 +63,10 @@ def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = No
     if any(recording.unit_found for recording in given):
         found["time_unit"] = unit
     if channels.degrees:
-        found["units"] = dict.fromkeys(channels.degrees, "deg")
-        log.notes[
-            f"angles without a unit are taken to be in deg: {listed(list(channels.degrees))}"
-        ] = None
+        found["units"] = {n: "deg" if yes else "rad" for n, yes in channels.degrees.items()}
+    in_degrees = [name for name, yes in channels.degrees.items() if yes]
+    if in_degrees:
+        log.notes[f"angles without a unit are taken to be in deg: {listed(in_degrees)}"] = None
     labelled = any(recording.label for recording in given)
     del given
     log.quaternions = [list(channels.names_of(four)) for four in channels.quaternions]

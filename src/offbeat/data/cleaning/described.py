@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class Channels:
     columns: dict[tuple[str, str], int]  # by signal and channel
     angles: dict[int, float]  # full turn of each, in its unit
     quaternions: tuple[tuple[int, ...], ...]
-    degrees: tuple[str, ...] = ()  # angles without a unit that were found to be in degrees
+    degrees: dict[str, bool] = field(default_factory=dict)  # of angles that state no unit
 
     @classmethod
     def of(cls, recordings: list[Recording], options: ReaderOptions) -> Channels:
@@ -43,7 +43,7 @@ class Channels:
         kinds: list[str] = []
         roles: list[str] = []
         looked_at: set[str] = set()
-        degrees: list[str] = []
+        degrees: dict[str, bool] = {}
         for signal in (signal for recording in recordings for signal in recording.signals):
             for channel, unit, kind, role in zip(
                 signal.channels, signal.units, signal.kinds, signal.roles, strict=True
@@ -91,9 +91,9 @@ class Channels:
         for name in options.angles:
             at = known("channel in angles", name)
             kinds[at] = "angle"
-            if not units[at] and _is_in_degrees(name, columns, at, recordings):
-                units[at] = "deg"
-                degrees.append(name)
+            if not units[at]:
+                degrees[name] = _is_in_degrees(name, columns, at, recordings)
+                units[at] = "deg" if degrees[name] else ""
         gone = {name for recording in recordings for name in recording.left_out}
         left_out = {
             name for name in options.without
@@ -123,7 +123,7 @@ class Channels:
                 if options.quaternions == "continuous"
                 and all(at in kept and roles[at] != "action" for at in four)
             ),
-            tuple(degrees),
+            degrees,
         )
 
     def keep(self, signal: Signal) -> Signal | None:

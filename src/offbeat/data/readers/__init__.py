@@ -9,13 +9,14 @@ from __future__ import annotations
 import inspect
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from offbeat.data import store
 from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, ulog
+from offbeat.data.readers.folders import FILES, check_paths, files_in, together
 from offbeat.data.recording import ReaderOptions, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
@@ -108,12 +109,21 @@ def register_reader(
     return READERS.register(name, reader, replace=replace)
 
 
-def read(path: str | Path, *, format: str | None = None, **options: Any) -> Dataset:
+def read(
+    path: str | Path | Sequence[str | Path],
+    *,
+    format: str | None = None,
+    files: Literal["auto", "episodes", "merge"] = "auto",
+    **options: Any,
+) -> Dataset:
     """Reads a data set from a file, or a folder of files, of any known format.
 
     Args:
-        path: the file or folder.
+        path: the file or folder; or several files of one format, as a list or in a folder.
         format: name of the reader; by default found by the file's suffix and content.
+        files: of several files, each holds one or several `episodes`; or a sensor of one recording,
+            and they are merged (`merge`) by their times. `auto` merges files no two of which have a
+            channel in common.
         **options: options of the format, such as `time_unit` of CSV, and the fields of
             `ReaderOptions`, for every format but Offbeat's own.
 
@@ -126,8 +136,72 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
         FileFormatError: the file is missing, of an unknown format, or invalid.
         InputError: the format or an option is unknown.
     """
+    one_of("files", files, FILES)
+    if not isinstance(path, str | Path):
+        listed = [require_source(one) for one in check_paths(path)]
+        return _read_several(listed, listed[0].parent, format, files, options)
     path = require_source(path)
+    if path.is_dir():
+        inside = _files_of(path, format)
+        if inside:
+            return _read_several(inside, path, format, files, options)
     reader = reader_of(path) if format is None else READERS[format]
+    own, cleaning = _split(options, reader)
+    made = _made(reader, path, own)
+    if isinstance(made, Dataset):
+        if cleaning:
+            raise InputError(
+                f"the {reader.name} reader gives a finished data set, which is not cleaned again, "
+                f"got the options {', '.join(cleaning)}"
+            )
+        return made
+    return _assembled(made, path, reader, cleaning)
+
+
+def _read_several(
+    paths: list[Path], folder: Path, format: str | None, files: str, options: dict[str, Any]
+) -> Dataset:
+    """Several files as one data set."""
+    readers = {path: reader_of(path) if format is None else READERS[format] for path in paths}
+    names = sorted({reader.name for reader in readers.values()})
+    if len(names) > 1:
+        raise FileFormatError(
+            f"{folder} holds files of several formats, {', '.join(names)}; name one with format="
+        )
+    reader = readers[paths[0]]
+    own, cleaning = _split(options, reader)
+    read_files: list[tuple[Path, list[Recording]]] = []
+    for path in paths:
+        made = _made(reader, path, own)
+        if isinstance(made, Dataset):
+            raise FileFormatError(
+                f"{path} is a finished data set, which is read alone; load each, and make one "
+                "Dataset of their trajectories"
+            )
+        read_files.append((path, made))
+    return _assembled(together(read_files, files, folder.name), folder, reader, cleaning)
+
+
+def _files_of(folder: Path, format: str | None) -> list[Path]:
+    """The files in a folder that no reader knows as a whole; empty if one does."""
+    of_folders = [reader for reader in READERS.values() if FOLDER in reader.suffixes]
+    if format is not None:
+        reader = READERS[format]
+        suffixes = set(reader.suffixes) - {FOLDER}
+        whole = reader in of_folders and reader.recognises and reader.recognises(folder)
+        return [] if whole else files_in(folder, suffixes)
+    if any(reader.recognises and reader.recognises(folder) for reader in of_folders):
+        return []
+    suffixes = {suffix for reader in READERS.values() for suffix in reader.suffixes} - {FOLDER}
+    return files_in(folder, suffixes)
+
+
+def _split(options: dict[str, Any], reader: Reader) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The options of a format, and those of the cleaning.
+
+    Raises:
+        InputError: an option is unknown.
+    """
     options = _renamed(options, reader)
     for option in options:
         if not reader.options:
@@ -138,15 +212,12 @@ def read(path: str | Path, *, format: str | None = None, **options: Any) -> Data
     if "missing" in own:
         options["missing"] = [m for m in _several(own["missing"]) if _is_number(m)]
         own["missing"] = [m for m in _several(own["missing"]) if not _is_number(m)]
-    options = {n: v for n, v in options.items() if n not in own or n in ("without", "missing")}
-    made = _made(reader, path, own)
-    if isinstance(made, Dataset):
-        if options:
-            raise InputError(
-                f"the {reader.name} reader gives a finished data set, which is not cleaned again, "
-                f"got the options {', '.join(options)}"
-            )
-        return made
+    return own, {n: v for n, v in options.items() if n not in own or n in ("without", "missing")}
+
+
+def _assembled(
+    made: list[Recording], path: Path, reader: Reader, options: dict[str, Any]
+) -> Dataset:
     dataset = assemble(_handed_over(made), ReaderOptions(**options))
     for note in dataset.meta["cleaning"]["notes"]:
         logging.getLogger("offbeat").warning("%s: %s", printable(str(path)), printable(note))
@@ -176,7 +247,11 @@ def _handed_over(made: list[Recording]) -> Iterable[Recording]:
 
 
 def _several(given: Any) -> list[Any]:
-    return [given] if isinstance(given, str | int | float) else list(given)
+    if isinstance(given, str | int | float):
+        return [given]
+    if isinstance(given, Iterable):
+        return list(given)
+    raise InputError(f"missing must be numbers or texts, got {given!r}")
 
 
 def _is_number(given: Any) -> bool:

@@ -20,6 +20,7 @@ from offbeat.errors import FileFormatError, one_of, require
 SUFFIXES = (".bag", ".db3", ".mcap")
 
 _MAGIC = (b"#ROSBAG V", b"SQLite format 3\0", b"\x89MCAP0\r\n")
+_APART_NS = 10**9  # difference of two clocks that is no delay
 _WAITING_BYTES = 16 * 2**20  # messages that wait to be decoded
 
 # Images, maps and texts are not channels unless they are selected.
@@ -46,7 +47,10 @@ _NOT_BY_DEFAULT = (
 def recognises(path: Path) -> bool:
     """Whether a file has the signature of a ROS bag or MCAP, or a folder is a ROS 2 bag."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file()
+        return any(
+            next(path.glob(form), None) is not None
+            for form in ("metadata.yaml", "*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
+        )
     return starts_with(path, _MAGIC)
 
 
@@ -90,7 +94,7 @@ def recordings(
     if not path.is_dir():
         require_file(path)
     with open_bag(path) as bag:
-        notes: list[str] = []
+        notes: list[str] = [*bag.notes]
         chosen = _chosen(bag.connections, topics, path, notes)
         wanted = Fields(fields, sorted({c.topic for c in chosen}))
         readers = _topic_readers(bag, chosen, wanted, typestore, path, notes, asked=bool(topics))
@@ -122,6 +126,11 @@ def _chosen(
     if topics is not None:
         known = {c.topic for c in connections}
         named = {one_of(f"topic of {path.name}", topic, known) for topic in topics}
+        foreign = {c.topic: c.encoding for c in connections
+                   if c.encoding not in ("ros1", "cdr") and c.topic not in named}  # fmt: skip
+        if foreign:
+            listed = ", ".join(f"{name} ({what})" for name, what in sorted(foreign.items()))
+            notes.append(f"topics without messages of ROS are left out: {listed}")
         return [c for c in connections if c.topic in named]
     chosen, left = [], {}
     for connection in connections:
@@ -189,7 +198,8 @@ def _topic_readers(
                     f"bag nor in the typestore {typestore!r}; name the distribution that has it "
                     f"with typestore=, one of: {', '.join(sorted(stores))}"
                 )
-        readers[name] = Topic(name, kind, definitions, bag.cdr, fields)
+        cdr = connection.encoding == "cdr"
+        readers[name] = Topic(name, kind, definitions, cdr, fields, optional=not asked)
     if assumed:
         notes.append(
             f"the bag does not define the messages of {', '.join(assumed)}; the definitions of "
@@ -220,6 +230,19 @@ def _read(bag: Bag, chosen: list[Connection], readers: dict[str, Topic], path: P
         raise FileFormatError(f"{path}: {error}") from None
 
 
+def _unmet(topics: list[Topic]) -> tuple[str, str] | None:
+    """Two topics whose header clocks have no time in common while they were received together."""
+    spans = sorted(((*t.span(header=True), t) for t in topics), key=lambda span: span[:2])
+    for i in range(1, len(spans)):
+        latest = max(span[1] for span in spans[:i])
+        if spans[i][0] <= latest:
+            continue
+        one = max(spans[:i], key=lambda span: span[1])[2]
+        if abs(spans[i][2].offset() - one.offset()) > _APART_NS:
+            return one.name, spans[i][2].name
+    return None
+
+
 def _clocks(topics: list[Topic], stamps: str, notes: list[str]) -> dict[str, bool]:
     """Whether each topic uses the stamps of its headers.
 
@@ -233,6 +256,13 @@ def _clocks(topics: list[Topic], stamps: str, notes: list[str]) -> dict[str, boo
     filled = [t for t in topics if t.parts]
     headed = [t for t in filled if chosen[t.name]]
     without = [t for t in filled if not chosen[t.name]]
+    unmet = _unmet(headed)
+    if unmet:
+        notes.append(
+            f"stamps are times of receipt: the clocks of the headers of {unmet[0]} and of "
+            f"{unmet[1]} have no time in common"
+        )
+        return dict.fromkeys(chosen, False)
     if headed and without:
         spans = [t.span(header=True) for t in headed]
         start, stop = min(s[0] for s in spans), max(s[1] for s in spans)

@@ -7,15 +7,15 @@ index of all messages is built, so memory does not grow with the bag.
 
 from __future__ import annotations
 
-import bz2
 import os
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from offbeat.data.readers.ros_mcap import LARGEST_CHUNK, Mcap, decompressed
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, OffbeatError, require
 
@@ -64,12 +64,12 @@ class Bag:
         connections: of the bag.
         messages: takes ids of connections; yields the id, the time of receipt in
             nanoseconds and the serialised message.
-        cdr: serialised by ROS 2.
+        notes: on a file that was cut off.
     """
 
     connections: tuple[Connection, ...]
     messages: Callable[[set[int]], Iterator[tuple[int, int, bytes]]]
-    cdr: bool
+    notes: tuple[str, ...] = ()
 
 
 @contextmanager
@@ -90,19 +90,83 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 with explained(path):
                     yield from bag.messages(ids)
 
-            yield Bag(tuple(bag.connections.values()), messages, cdr=False)
-    else:
-        yield from _open_ros2(path)
+            yield Bag(tuple(bag.connections.values()), messages)
+        return
+    inside = [path]
+    if path.is_dir():
+        inside = sorted(p for form in ("*.db3", "*.mcap") for p in path.glob(form))
+        packed = sorted(path.glob("*.zstd"))
+        if not inside and not packed:
+            raise FileFormatError(f"{path} holds no .db3 and no .mcap file, expected a ROS 2 bag")
+        if packed or (inside[0].suffix == ".db3" and (path / "metadata.yaml").is_file()):
+            yield from _open_ros2(path, inside)
+            return
+    opened = [_open_mcap(p) if p.suffix.lower() == ".mcap" else _open_ros2(p, [p]) for p in inside]
+    with ExitStack() as stack:
+        bags = [stack.enter_context(contextmanager(lambda made=made: made)()) for made in opened]
+        yield bags[0] if len(bags) == 1 else _together(bags)
 
 
-def _open_ros2(path: Path) -> Iterator[Bag]:
+def _together(bags: list[Bag]) -> Bag:
+    """The files of one bag, one after the other, as one."""
+    connections: list[Connection] = []
+    starts: list[int] = []
+    for bag in bags:
+        starts.append(len(connections))
+        connections += [replace(c, id=len(connections) + i) for i, c in enumerate(bag.connections)]
+
+    def messages(ids: set[int]) -> Iterator[tuple[int, int, bytes]]:
+        for start, bag in zip(starts, bags, strict=True):
+            new = {c.id: start + i for i, c in enumerate(bag.connections) if start + i in ids}
+            for number, received, message in bag.messages(set(new)):
+                yield new[number], received, message
+
+    notes = tuple(dict.fromkeys(note for bag in bags for note in bag.notes))
+    return Bag(tuple(connections), messages, notes)
+
+
+def _open_mcap(path: Path) -> Iterator[Bag]:
+    with require_file(path).open("rb") as file:
+        with explained(path):
+            mcap = Mcap(file)
+        forms = {"ros2msg": "msg", "ros1msg": "msg", "ros2idl": "idl", "omgidl": "idl", "": ""}
+
+        def messages(ids: set[int]) -> Iterator[tuple[int, int, bytes]]:
+            with explained(path):
+                yield from mcap.messages(ids)
+
+        note = f"{path.name} is cut off, as by a loss of power; the part before the cut is read"
+        yield Bag(
+            tuple(
+                Connection(
+                    c.id,
+                    c.topic,
+                    _full_name(c.kind),
+                    # A definition in another language is not one of ROS.
+                    c.encoding if c.form in forms else f"{c.encoding} with {c.form}",
+                    forms.get(c.form, ""),
+                    c.definition,
+                )
+                for c in mcap.channels.values()
+            ),
+            messages,
+            (note,) if mcap.cut else (),
+        )
+
+
+def _full_name(kind: str) -> str:
+    """The type of a message in the form of ROS 2: `std_msgs/Header` is `std_msgs/msg/Header`."""
+    package, _, name = kind.rpartition("/")
+    return f"{package.removesuffix('/msg')}/msg/{name}" if package else kind
+
+
+def _open_ros2(path: Path, inside: list[Path]) -> Iterator[Bag]:
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.rosbag2 import Reader
 
     forms = {MessageDefinitionFormat.MSG: "msg", MessageDefinitionFormat.IDL: "idl"}
     with explained(path):
-        inside = sorted(p for form in ("*.db3", "*.mcap") for p in path.glob(form))
-        for file in [path] if path.is_file() else inside:
+        for file in inside:
             _check_length(require_file(file))
         reader = Reader(path)
         try:
@@ -133,7 +197,6 @@ def _open_ros2(path: Path) -> Iterator[Bag]:
                 for c in connections.values()
             ),
             messages,
-            cdr=True,
         )
     finally:
         reader.close()
@@ -162,10 +225,10 @@ def explained(path: Path) -> Iterator[None]:
         if str(path) in str(error):
             raise
         raise FileFormatError(f"{path}: {error}") from None
-    except (OffbeatError, MemoryError):
+    except OffbeatError:
         raise
     except Exception as error:
-        what = " ".join(str(error).split()) or type(error).__name__
+        what = " ".join(str(error).split())[:90] or type(error).__name__
         repair = "rosbag reindex" if path.suffix.lower() == ".bag" else "ros2 bag reindex"
         raise FileFormatError(
             f"{path} can't be read as a ROS bag, it is truncated, damaged or of another format "
@@ -227,11 +290,10 @@ class _Bag1:
     def _connect(self, header: Mapping[bytes, bytes], data: bytes) -> None:
         (number,) = _U4(header[b"conn"])
         described = _fields(data)
-        package, _, name = described[b"type"].decode().rpartition("/")
         self.connections[number] = Connection(
             number,
             header[b"topic"].decode(),
-            f"{package.removesuffix('/msg')}/msg/{name}",
+            _full_name(described[b"type"].decode()),
             "ros1",
             "msg",
             described[b"message_definition"].decode(errors="replace"),
@@ -244,8 +306,11 @@ class _Bag1:
             header, data = self._record()
             if header[b"op"][0] != _CHUNK:
                 raise ValueError(f"there is no chunk at {position}")
-            chunk = _decompressed(header[b"compression"].decode(), data)
-            if len(chunk) != _U4(header[b"size"])[0]:
+            size = _U4(header[b"size"])[0]
+            if size > LARGEST_CHUNK:
+                raise ValueError(f"the chunk at {position} has {size} bytes")
+            chunk = decompressed(data, header[b"compression"].decode(), size)
+            if len(chunk) != size:
                 raise ValueError(f"the chunk at {position} is not complete")
             yield from _of_chunk(chunk, ids)
 
@@ -294,14 +359,3 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
             raise ValueError("a header is damaged")
         fields[name] = value
     return fields
-
-
-def _decompressed(compression: str, data: bytes) -> bytes:
-    if compression == "none":
-        return data
-    if compression == "bz2":
-        return bz2.decompress(data)
-    if compression == "lz4":
-        decompress: Callable[[bytes], bytes] = require("lz4.frame", "ros").decompress
-        return decompress(data)
-    raise ValueError(f"compression {compression!r} is not known")

@@ -68,6 +68,14 @@ _UNITS = {
 }
 
 
+class UnreadableTypeError(FileFormatError):
+    """The messages of a topic have fields that can't be read."""
+
+
+_DEEPEST = 50  # messages in messages
+_MOST_MESSAGES = 1000  # of a list whose fields become channels
+
+
 @dataclass(frozen=True)
 class Column:
     """One number of a message: a channel.
@@ -95,11 +103,13 @@ class Row:
         suffix: suffix of the signal's name after the topic: the child frame of a transform.
         columns: the channels.
         stamp: positions of seconds and nanoseconds of the header's stamp; None without a header.
+        frames: the frame that the values are in, and the child frame where the message has one.
     """
 
     suffix: str = ""
     columns: list[Column] = field(default_factory=list)
     stamp: tuple[int, int] | None = None
+    frames: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -239,7 +249,9 @@ class _Parser:
     def message(self, kind: str, path: str, row: Row, unit: str) -> None:
         """Parses the fields of a message; a message that is not a field is a separate row."""
         if kind not in self.definitions:
-            raise FileFormatError(f"the message type {kind} is not defined")
+            raise UnreadableTypeError(f"the message type {kind} is not defined")
+        if path.count(".") > _DEEPEST:
+            raise UnreadableTypeError(f"messages are nested more than {_DEEPEST} deep")
         start = f"{path}." if path else ""
         if not path:
             self.rows.append(row)
@@ -257,7 +269,10 @@ class _Parser:
                 else:
                     self.message(what, here, row, unit_here)
             elif node == _BASE and what[0] not in _CODES:
-                self._string(what[0])
+                is_frame = here in ("header.frame_id", "child_frame_id")
+                text = self._string(what[0], keep=is_frame)
+                if is_frame and (name == "frame_id" or kind != _TRANSFORM):
+                    row.frames = (*row.frames, text)
                 if not here.startswith("header."):
                     self.skipped.setdefault(here, "text")
             elif node == _BASE:
@@ -268,7 +283,7 @@ class _Parser:
                 if node != _ARRAY:
                     count = self._length()
                 if inner == _NAME:
-                    self._messages(detail, here, count)
+                    self._messages(detail, here, count, row)
                 elif detail[0] not in _CODES:
                     texts = [self._string(detail[0], keep=name in _NAMES) for _ in range(count)]
                     if name in _NAMES:
@@ -287,20 +302,31 @@ class _Parser:
                 Column(c.name, c.offset, c.code, "", "quaternion") for c in row.columns[first:]
             ]
 
-    def _messages(self, kind: str, here: str, count: int) -> None:
-        """Parses a list of messages: separate rows if they are transforms, else left out."""
+    def _messages(self, kind: str, here: str, count: int, row: Row) -> None:
+        """Parses a list of messages: separate rows if they are transforms.
+
+        Others are left out by default; those that are selected have channels `here[0].x`.
+        """
+        if kind != _TRANSFORM and self.wanted is not None and count <= _MOST_MESSAGES:
+            for i in range(count):
+                self.message(kind, f"{here}[{i}]", row, "")
+            if count:
+                self.available.append(here)
+            return
+        if kind != _TRANSFORM:
+            self.available.append(here)
         for _ in range(count):
             mark, known = len(self.rows), len(self.available)
-            row = Row()
+            own = Row()
             skipped, self.skipped = self.skipped, {}
-            self.message(kind, "", row, "")
+            self.message(kind, "", own, "")
             self.skipped = skipped
             if kind == _TRANSFORM:
-                row.suffix = self._child(row)
+                own.suffix = self._child(own)
             else:
                 del self.rows[mark:], self.available[known:]
         if kind != _TRANSFORM:
-            self.skipped.setdefault(here, "a list of messages")
+            self.skipped.setdefault(here, "a list of messages, unless chosen with fields=")
 
     def _child(self, row: Row) -> str:
         """The child frame of the transform that was just parsed; its bytes must agree."""
@@ -359,7 +385,7 @@ class _Parser:
 
     def _string(self, base: str, *, keep: bool = False) -> str:
         if base != "string":
-            raise FileFormatError(f"fields of type {base} can't be read")
+            raise UnreadableTypeError(f"fields of type {base} can't be read")
         length = self._length()
         start = self.base + self.position
         self.position += length

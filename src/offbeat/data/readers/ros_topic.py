@@ -9,10 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.readers.options import Fields
-from offbeat.data.readers.ros_layout import Column, Definitions, Layout, find_layout
+from offbeat.data.readers.ros_layout import (
+    Column,
+    Definitions,
+    Layout,
+    UnreadableTypeError,
+    find_layout,
+)
 from offbeat.data.signals import Signal
 from offbeat.errors import FileFormatError
 
+_Key = tuple[str, tuple[str, ...]]
+_MOST_FRAMES = 16  # of one signal
 _LAYOUTS = 64  # kept per topic and length of message
 
 
@@ -39,9 +47,11 @@ class Topic:
         fields: the selected fields.
         times: times of receipt of the waiting messages, in nanoseconds.
         messages: the waiting messages.
-        parts: decoded rows, by the suffix of their signal.
+        parts: decoded rows, by the suffix of their signal and their frames.
         layouts: known layouts, by the length of their messages.
         skipped: fields that are left out, each with the reason.
+        optional: whether the topic is left out if its messages have a type that can't be read.
+        unreadable: why it is left out.
     """
 
     name: str
@@ -51,15 +61,28 @@ class Topic:
     fields: Fields
     times: list[int] = field(default_factory=list)
     messages: list[bytes] = field(default_factory=list)
-    parts: dict[str, list[_Part]] = field(default_factory=dict)
+    parts: dict[_Key, list[_Part]] = field(default_factory=dict)
     layouts: dict[int, list[Layout]] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
+    optional: bool = False
+    unreadable: str = ""
 
     def decode(self) -> None:
         """Decodes the waiting messages."""
+        try:
+            if not self.unreadable:
+                self._decode()
+        except UnreadableTypeError as error:
+            if not self.optional:
+                raise
+            self.unreadable = str(error)
+            self.parts.clear()
+        self.times, self.messages = [], []
+
+    def _decode(self) -> None:
         received = np.array(self.times, dtype=np.int64)
         lengths = np.fromiter(map(len, self.messages), dtype=np.intp, count=len(self.messages))
-        found: dict[str, list[_Part]] = {}
+        found: dict[_Key, list[_Part]] = {}
         for length in np.unique(lengths):
             where = np.flatnonzero(lengths == length)
             joined = b"".join([self.messages[i] for i in where])
@@ -79,7 +102,6 @@ class Topic:
                 table, where = table[~fits], where[~fits]
         for suffix, parts in found.items():
             self.parts.setdefault(suffix, []).extend(_in_order(parts))
-        self.times, self.messages = [], []
 
     def _layout(self, message: bytes) -> Layout:
         try:
@@ -91,7 +113,7 @@ class Topic:
                 wanted=self.fields.of(self.name),
             )
         except FileFormatError as error:
-            raise FileFormatError(f"topic {self.name}: {error}") from None
+            raise type(error)(f"topic {self.name}: {error}") from None
         for name, why in layout.skipped.items():
             self.skipped.setdefault(name, why)
         self.fields.available.update(dict.fromkeys(layout.available))
@@ -103,10 +125,10 @@ class Topic:
         table: NDArray[np.uint8],
         where: NDArray[np.intp],
         received: NDArray[np.int64],
-        found: dict[str, list[_Part]],
+        found: dict[_Key, list[_Part]],
     ) -> None:
         for row in layout.rows:
-            found.setdefault(row.suffix, []).append(
+            found.setdefault((row.suffix, row.frames), []).append(
                 _Part(
                     where,
                     layout.stamps(table, row),
@@ -123,6 +145,40 @@ class Topic:
         return bool(every) and all(
             stamps is not None and bool((stamps != 0).any()) for stamps in every
         )
+
+    def offset(self) -> float:
+        """The median of header stamp minus time of receipt, in nanoseconds."""
+        every = [
+            part.header - part.received
+            for parts in self.parts.values()
+            for part in parts
+            if part.header is not None
+        ]
+        return float(np.median(np.concatenate(every)))
+
+    def _names(self, notes: list[str]) -> dict[_Key, str]:
+        """The name of the signal of each suffix and frame."""
+        frames_of: dict[str, list[tuple[str, ...]]] = {}
+        for suffix, frames in self.parts:
+            frames_of.setdefault(suffix, []).append(frames)
+        named: dict[_Key, str] = {}
+        for suffix, several in frames_of.items():
+            start = [self.name, suffix] if suffix else [self.name]
+            shown = ", ".join("/".join(frames) or "''" for frames in several[:4])
+            if len(several) > _MOST_FRAMES:
+                notes.append(
+                    f"{'/'.join(start)}: the frame changes between {len(several)} ({shown}, ...); "
+                    "they are read as one"
+                )
+            elif len(several) > 1:
+                notes.append(
+                    f"{'/'.join(start)} is given in several frames ({shown}); each is a signal"
+                )
+            for frames in several:
+                inner = [self.name, *frames, suffix] if suffix else [self.name, *frames]
+                apart = 1 < len(several) <= _MOST_FRAMES
+                named[suffix, frames] = "/".join(inner if apart else start)
+        return named
 
     def span(self, *, header: bool) -> tuple[int, int]:
         """The first and the last stamp."""
@@ -141,10 +197,17 @@ class Topic:
                 f"{self.name}: left out "
                 + ", ".join(f"{name} ({why})" for name, why in self.skipped.items())
             )
-        if not self.parts and not self.messages:
+        if not self.parts and not self.messages and not self.unreadable:
             notes.append(f"{self.name} ({self.kind}) has no selected numbers")
-        for suffix in list(self.parts):
-            parts = self.parts.pop(suffix)
+        if self.unreadable:
+            notes.append(f"{self.name} is left out: {self.unreadable}")
+            return
+        names = self._names(notes)
+        for key, name in names.items():
+            parts = self.parts.pop(key)
+            # Rows of several frames are in the order of the log only together.
+            for other in [k for k, n in names.items() if n == name and k in self.parts]:
+                parts += self.parts.pop(other)
             columns = {c.name: c for part in parts for c in part.columns}
             rows = sum(len(part.order) for part in parts)
             stamps = np.empty(rows, dtype=np.int64)
@@ -163,7 +226,7 @@ class Topic:
                 part.values = np.empty((0, 0))
                 first = last
             yield Signal(
-                f"{self.name}/{suffix}" if suffix else self.name,
+                name,
                 stamps,
                 values,
                 tuple(columns),
