@@ -118,20 +118,19 @@ def read_npz(
     options = _with_labels(path, arrays, options, table, shape)
     gone = {n for n in options.without for n in (n, *(f for f in table if f.startswith(f"{n}.")))}
     table = {name: column for name, column in table.items() if name not in gone}
-    names = [*table]
     for name in options.units or {}:
-        one_of("channel in units", name, names)
+        one_of("channel in units", name, table)
+    stamps = [name for name in (stamp.time, stamp.rest) if name]
     options = replace(
-        options, units={**{n: u for n, u in stated.items() if n in table}, **(options.units or {})},
-        time_column=None, rate_hz=1.0, without=(),
-    )  # fmt: skip
-    columns = Columns.of(path, names, options, _NpzSample(table))
-    columns = replace(
-        columns,
-        time=stamp.time,
-        notes=(*stamp.notes, *columns.notes[1:]),
-        left_out=(*columns.left_out, *left, *gone),
+        options,
+        units={**{n: u for n, u in stated.items() if n in table}, **(options.units or {})},
+        time_column=stamps or None,
+        without=(),
     )
+    times = {name: clock if len(shape) == 2 else arrays[name] for name in stamps}
+    sample = _NpzSample({**times, **table})
+    columns = Columns.of(path, [*stamps, *table], options, sample)
+    columns = replace(columns, left_out=(*columns.left_out, *left, *gone))
     values = np.stack([table[name].astype(np.float64) for name in columns.channels])
     gathered = Gathered(clock, _coded(table, columns.label), _coded(table, columns.key), values.T)
     return recordings(path, columns, unit, notes, gathered, found=found)

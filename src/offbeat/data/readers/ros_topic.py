@@ -163,6 +163,7 @@ class Topic:
             frames_of.setdefault(suffix, []).append(frames)
         named: dict[_Key, str] = {}
         for suffix, several in frames_of.items():
+            several.sort()
             start = [self.name, suffix] if suffix else [self.name]
             shown = ", ".join("/".join(frames) or "''" for frames in several[:4])
             if len(several) > _MOST_FRAMES:

@@ -1,0 +1,270 @@
+"""Tables as programs write them, one generator per kind, with the times and values they mean.
+
+A kind is written in every format that can express it: CSV, Parquet, NPZ.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+ROWS = 40
+STEP_NS = 20_000_000
+NS = 1_764_000_000_000_000_007 + STEP_NS * np.arange(ROWS)
+TIMES = STEP_NS * np.arange(ROWS) / 1e9
+X = np.round(np.sin(0.3 * np.arange(ROWS)), 6)
+Y = np.round(10 * np.cos(0.2 * np.arange(ROWS)), 6)
+
+Columns = Mapping[str, Sequence[Any]]
+
+
+def write_csv(path: Path, columns: Columns, *, delimiter: str = ",") -> Path:
+    """A header and rows; None and NaN are empty fields."""
+    lines = [delimiter.join(columns)]
+    lines += [
+        delimiter.join("" if v is None or v != v else str(v) for v in row)
+        for row in zip(*columns.values(), strict=True)
+    ]
+    path = path.with_suffix(".csv")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def write_parquet(path: Path, columns: Columns) -> Path:
+    """A column of its type each."""
+    path = path.with_suffix(".parquet")
+    pq.write_table(pa.table({name: pa.array(values) for name, values in columns.items()}), path)
+    return path
+
+
+def write_npz(path: Path, columns: Columns) -> Path:
+    """An array each."""
+    path = path.with_suffix(".npz")
+    np.savez(path, **{name: np.array(values) for name, values in columns.items()})
+    return path
+
+
+FORMATS: dict[str, Callable[[Path, Columns], Path]] = {
+    "csv": write_csv,
+    "parquet": write_parquet,
+    "npz": write_npz,
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of table.
+
+    Attributes:
+        columns: by name.
+        values: expected ones, by channel; the names are in the order of the data set.
+        times: expected ones, s.
+        options: of `read`.
+        formats: that can express it.
+        note: part of a note that is expected, or empty.
+        units: expected ones, by channel; others are empty.
+    """
+
+    columns: Columns
+    values: Mapping[str, Any]
+    times: Any = field(default_factory=lambda: TIMES)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    formats: tuple[str, ...] = ("csv", "parquet", "npz")
+    note: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+
+
+def texts(stamps: Any, form: str) -> list[str]:
+    """Nanoseconds as texts of a date and time."""
+    return [_text(int(t), form) for t in stamps]
+
+
+def _text(nanoseconds: int, form: str) -> str:
+    moment = datetime.fromtimestamp(nanoseconds // 10**9, UTC)
+    return moment.strftime(form) + f".{nanoseconds % 10**9:09d}"
+
+
+XY = {"x": X, "y": Y}
+SEC, REST = NS // 10**9, NS % 10**9
+TWO = {"GyrX": np.ravel(np.column_stack([X, Y])), "AccZ": np.tile([-9.8, -10.8], ROWS)}
+NIGHT = 86_400 * 10**9 - STEP_NS * 10 + STEP_NS * np.arange(ROWS)  # passes midnight
+NOON = (12 * 3600 + 59 * 60 + 59) * 10**9 + STEP_NS * np.arange(20, 20 + ROWS)  # passes 1 PM
+
+
+def of_day(stamps: Any) -> list[str]:
+    """Nanoseconds as times of day."""
+    return [_text(int(t) % (86_400 * 10**9), "%H:%M:%S")[:-3] for t in stamps]
+
+
+KINDS: dict[str, Kind] = {
+    "a stamp in seconds and nanoseconds": Kind({"sec": SEC, "nanosec": REST, **XY}, XY),
+    "a stamp named like a time in two columns": Kind(
+        {"timestamp_sec": SEC, "timestamp_nanosec": REST, **XY}, XY
+    ),
+    "the stamp of a header of ROS 1": Kind(
+        {"header.seq": np.arange(ROWS), "header.stamp.secs": SEC, "header.stamp.nsecs": REST, **XY},
+        {"header.seq": np.arange(ROWS), **XY},
+        note="joined from columns 'header.stamp.secs' and 'header.stamp.nsecs'",
+    ),
+    "a stamp in seconds and microseconds": Kind(
+        {"stamp/sec": SEC, "stamp/usec": REST // 1000, **XY}, XY
+    ),
+    "a stamp in two columns that are named": Kind(
+        {"a": SEC, "b": REST, **XY}, XY, options={"time_column": ["a", "b"]}
+    ),
+    "a date and a time of day": Kind(
+        {
+            "Date": [t[:10] for t in texts(NS, "%Y-%m-%dT")],
+            "Time": [t[11:23] for t in texts(NS, "%Y-%m-%dT%H:%M:%S")],
+            **XY,
+        },
+        XY,
+    ),
+    "times of day": Kind({"time": of_day(NS), **XY}, XY),
+    "times of day past midnight": Kind({"time": of_day(NIGHT), **XY}, XY),
+    "times of day in halves": Kind(
+        {"time": [f"{_text(int(t), '%I:%M:%S')} PM" for t in NOON], **XY}, XY
+    ),
+    "texts of ISO 8601": Kind({"time": texts(NS, "%Y-%m-%dT%H:%M:%S"), **XY}, XY),
+    "texts with slashes": Kind({"time": texts(NS, "%Y/%m/%d %H:%M:%S"), **XY}, XY),
+    "texts with the day first": Kind({"time": texts(NS, "%d.%m.%Y %H:%M:%S"), **XY}, XY),
+    "milliseconds in brackets without a blank": Kind(
+        {"time(ms)": 20 * np.arange(ROWS), "angle(deg)": X, "x[0]": Y},
+        {"angle": X, "x[0]": Y},
+        units={"angle": "deg"},
+    ),
+    "minutes": Kind({"time_min": TIMES / 60, **XY}, XY),
+    "hours": Kind({"Time (h)": TIMES / 3600, **XY}, XY),
+    "days": Kind({"time [d]": TIMES / 86_400, **XY}, XY),
+    "microseconds of ArduPilot": Kind({"TimeUS": (NS - NS[0]) // 1000, **XY}, XY),
+    "a wrong unit in the header": Kind(
+        {"time_ms": TIMES, **XY}, XY, options={"time_unit": "s"}, note="not as 'time_ms' does"
+    ),
+    "whole numbers without a unit": Kind(
+        {"time": 10 * np.arange(ROWS), **XY},
+        XY,
+        times=10.0 * np.arange(ROWS),
+        note="taken to be in s, a row every 10 s",
+    ),
+    "the clock of rostopic": Kind({"%time": NS, **XY}, XY),
+    "the clock of PlotJuggler": Kind({"__time": NS / 1e9, **XY}, XY, times=None),
+    "no times": Kind(
+        {**XY}, XY, options={"rate_hz": 50}, note="row number / 50 Hz, as rate_hz says"
+    ),
+    "a column of text": Kind({"time": TIMES, "mode": ["AUTO"] * ROWS, **XY}, XY, note="'mode'"),
+    "a column of text that is left out": Kind(
+        {"time": TIMES, "mode": ["AUTO"] * ROWS, **XY},
+        {"y": Y},
+        options={"without": ["mode", "x"]},
+    ),
+    "instances of a sensor": Kind(
+        {"timestamp": np.repeat(TIMES, 2), "I": np.tile([0, 1], ROWS), **TWO},
+        {"GyrX[0]": X, "AccZ[0]": [-9.8] * ROWS, "GyrX[1]": Y, "AccZ[1]": [-10.8] * ROWS},
+        note="rows are of the sensor in column 'I'",
+    ),
+    "sensors that take turns": Kind(
+        {"time": np.repeat(TIMES, 2), "sensor": ["left", "right"] * ROWS, **TWO},
+        {"left.GyrX": X, "left.AccZ": [-9.8] * ROWS, "right.GyrX": Y, "right.AccZ": [-10.8] * ROWS},
+    ),
+    "sensors in a column that is named": Kind(
+        {"time": np.repeat(TIMES, 2), "unit": np.tile([3, 7], ROWS), **TWO},
+        {"GyrX[3]": X, "AccZ[3]": [-9.8] * ROWS, "GyrX[7]": Y, "AccZ[7]": [-10.8] * ROWS},
+        options={"instance_column": "unit"},
+    ),
+    "channels called signal and value": Kind(
+        {"time": TIMES, "signal": X, "value": Y}, {"signal": X, "value": Y}
+    ),
+    "a number that stands for a missing value": Kind(
+        {"time": TIMES, "x": np.where(np.arange(ROWS) == 5, -999, X), "y": Y},
+        {"x": np.where(np.arange(ROWS) == 5, np.nan, X), "y": Y},
+        options={"missing": [-999]},
+    ),
+    "a text that stands for a missing value": Kind(
+        {"time": TIMES, "x": [*X[:5].tolist(), "lost", *X[6:].tolist()], "y": Y},
+        {"x": np.where(np.arange(ROWS) == 5, np.nan, X), "y": Y},
+        options={"missing": ["lost"]},
+        formats=("csv",),
+    ),
+    "an angle in degrees without a unit": Kind(
+        {"time": TIMES, "yaw": 27 * np.arange(ROWS) % 360},
+        {"yaw": 27 * np.arange(ROWS)},
+        options={"angles": ["yaw"]},
+        note="taken to be in deg: yaw",
+        units={"yaw": "deg"},
+    ),
+    "a unit that is stated": Kind(
+        {"time": TIMES, **XY}, XY, options={"units": {"x": "m"}}, units={"x": "m"}
+    ),
+}
+BODY = "".join(f"{t:.2f},{x},{y}\n" for t, x, y in zip(TIMES, X, Y, strict=True))
+"""Rows of CSV."""
+
+TEXTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
+    "lines above the header": (
+        "#Bench Recorder\n#Date Time: 2025-11-24 13:10:34\n\nTime (s),x,y\n" + BODY, {}, "",
+    ),
+    "text above the header": (
+        "Bench Recorder\nRate,100\n\ntime,x,y\n" + BODY, {}, "the header is line 4",
+    ),
+    "a line of units": ("time,x,y\ns,m,deg\n" + BODY, {}, "line 2 is taken for the units"),
+    "a header in a comment": ("# time,x,y\n" + BODY, {}, ""),
+    "a header behind %": ("%time,x,y\n" + BODY, {}, ""),
+    "comments between rows": (
+        "time,x,y\n" + BODY[:200] + BODY[200:].replace("\n", "\n# lost, two\n// or one\n", 1),
+        {}, "",
+    ),
+    "a line that names the separator": ("sep=;\ntime;x;y\n" + BODY.replace(",", ";"), {}, ""),
+    "bars": ("time|x|y\n" + BODY.replace(",", "|"), {}, ""),
+    "blanks": ("  time   x  y\n" + BODY.replace(",", "   "), {}, ""),
+    "blanks and comments": ("# time x y\n" + BODY.replace(",", " "), {}, ""),
+    "decimal commas": (
+        "time;x;y\n" + BODY.replace(",", ";").replace(".", ","), {}, "commas in numbers",
+    ),
+    "no header": (BODY, {"column_names": ["time", "x", "y"]}, ""),
+    "rows that count from an unnamed column": (
+        ",time,x,y\n" + "".join(f"{i},{row}\n" for i, row in enumerate(BODY.split())), {},
+        "has no name and counts the rows",
+    ),
+    "an unnamed column of times": (",x,y\n" + BODY, {}, "is taken for the time"),
+    "delimiters at the end of rows": ("time,x,y\n" + BODY.replace("\n", ",\n"), {}, ""),
+    "plus signs": ("time,x,y\n" + BODY.replace(",0.", ",+0."), {}, ""),
+    "UTF-16": (("time,x,y\n" + BODY).encode("utf-16"), {}, ""),
+    "Windows-1252": ("time,x,y,d\xe9j\xe0\n".encode("cp1252")
+                     + BODY.replace("\n", ",1\n").encode(), {"without": ["d\xe9j\xe0"]},
+                     "read as Windows-1252"),
+    "gzip": (gzip.compress(("time,x,y\n" + BODY).encode()), {}, ""),
+    "a cut in the last row": (
+        "time,x,y\n" + BODY + "0.80,0.5", {}, "ends in the middle of line 42",
+    ),
+}  # fmt: skip
+"""Forms of one table as text: what is written, options, and a note that is expected."""
+
+MISSING_TEXTS = (
+    *("", "-", "--", "?", "nan", "NaN", "-nan", "NA", "N/A", "null", "None", "NaN(ind)"),
+    *("-nan(ind)", "1.#IND", "-1.#IND", "1.#QNAN", "#N/A", "#DIV/0!"),
+)
+
+REFUSED: dict[str, tuple[Columns, dict[str, Any], str]] = {
+    "float32 epochs": (
+        {"time": np.float32(NS / 1e9).astype(float), **XY}, {}, "rows have the time stamp of",
+    ),
+    "a stamp of a spreadsheet": ({"time": [1.764e18] * ROWS, **XY}, {}, "of another row"),
+    "stamps of 0": ({"time": np.zeros(ROWS), **XY}, {}, "of another row and other values"),
+    "several stamps": (
+        {"imu/stamp/sec": SEC, "imu/stamp/nanosec": REST, "odom/stamp/sec": SEC,
+         "odom/stamp/nanosec": REST, "x": X}, {}, "has several stamps, each in two columns",
+    ),
+    "an angle of rad or deg": (
+        {"time": TIMES, "yaw": np.linspace(0, 50, ROWS)}, {"angles": ["yaw"]},
+        "may be rad or deg; state it with units=",
+    ),
+}  # fmt: skip
+"""Tables that can't be read without a choice, with the line that asks for it."""

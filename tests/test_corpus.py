@@ -1,0 +1,344 @@
+"""Logs as programs write them: each kind is read with the right values, or asks in one line."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from corpus import logs, tables
+
+from offbeat.data.readers import read
+from offbeat.errors import FileFormatError, InputError, OffbeatError
+
+WRITTEN = [(name, form) for name, kind in tables.KINDS.items() for form in kind.formats]
+
+
+def notes(dataset):
+    return "\n".join(dataset.meta["cleaning"]["notes"])
+
+
+@pytest.mark.parametrize(("name", "form"), WRITTEN)
+def test_a_table_has_the_times_and_values_that_it_means(name, form, tmp_path):
+    kind = tables.KINDS[name]
+    path = tables.FORMATS[form](tmp_path / "log", kind.columns)
+    (trajectory,) = dataset = read(path, **kind.options)
+    assert dataset.names == tuple(kind.values)
+    expected = tables.TIMES if kind.times is None else kind.times
+    assert trajectory.times == pytest.approx(expected, abs=2e-7 if kind.times is None else 1e-9)
+    for channel, values in kind.values.items():
+        column = trajectory.values[:, dataset.names.index(channel)]
+        assert column == pytest.approx(np.asarray(values, dtype=float), abs=1e-9, nan_ok=True)
+    assert dict(zip(dataset.names, dataset.units, strict=True)) == {
+        n: kind.units.get(n, "") for n in dataset.names
+    }
+    assert kind.note in notes(dataset)
+
+
+@pytest.mark.parametrize("name", tables.TEXTS)
+def test_a_text_file_is_read_in_the_form_it_has(name, tmp_path):
+    content, options, note = tables.TEXTS[name]
+    path = tmp_path / "log.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    (trajectory,) = dataset = read(path, **options)
+    assert dataset.names == ("x", "y")
+    assert trajectory.times == pytest.approx(tables.TIMES, abs=1e-12)
+    assert trajectory.values.tolist() == np.column_stack([tables.X, tables.Y]).tolist()
+    assert note in notes(dataset)
+    assert dataset.units == (("m", "deg") if "units" in name else ("", ""))
+
+
+@pytest.mark.parametrize("text", tables.MISSING_TEXTS)
+def test_a_marker_of_a_missing_value_is_one_wherever_it_is(text, tmp_path):
+    rows = [f"{t:.2f},{x},1" for t, x in zip(tables.TIMES, tables.X, strict=True)]
+    for row in (0, 1, tables.ROWS - 1):
+        marked = [*rows[:row], f"{tables.TIMES[row]:.2f},{text},1", *rows[row + 1 :]]
+        path = tmp_path / "log.csv"
+        path.write_text("time,x,y\n" + "\n".join(marked) + "\n")
+        dataset = read(path)
+        assert np.flatnonzero(np.isnan(dataset[0].values[:, 0])).tolist() == [row]
+
+
+@pytest.mark.parametrize("empty", [3, 1200])
+def test_booleans_are_numbers_wherever_they_begin(empty, tmp_path):
+    rows = [f"{i},{'' if i < empty else ('True', 'False')[i % 2]}" for i in range(empty + 50)]
+    (tmp_path / "log.csv").write_text("time_ms,contact\n" + "\n".join(rows) + "\n")
+    column = read(tmp_path / "log.csv")[0].values[:, 0]
+    assert np.isnan(column[:empty]).all()
+    assert column[empty:].tolist() == [float(i % 2 == 0) for i in range(empty, empty + 50)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "options", "expected"),
+    [
+        (('"2,590"', '"3,100.5"'), {}, [2590, 3100.5]),
+        (("2,590", "3,100"), {"delimiter": ";", "decimal": ","}, [2.59, 3.1]),
+        (("2,590", "3,100"), {"delimiter": ";", "decimal": "."}, [2590, 3100]),
+        (("2,590", "3,1"), {"delimiter": ";"}, [2.59, 3.1]),
+    ],
+)
+def test_a_comma_of_thousands_is_no_decimal_point(fields, options, expected, tmp_path):
+    sign = options.get("delimiter", ",")
+    text = f"time{sign}x\n0{sign}{fields[0]}\n1{sign}{fields[1]}\n"
+    (tmp_path / "log.csv").write_text(text)
+    assert read(tmp_path / "log.csv", **options)[0].values[:, 0].tolist() == expected
+
+
+def test_a_comma_that_may_be_either_is_asked_for(tmp_path):
+    (tmp_path / "log.csv").write_text("time;x\n0;2,590\n1;3,100\n")
+    with pytest.raises(InputError, match=r"such as '2,590'.*decimal=',' or decimal='.'"):
+        read(tmp_path / "log.csv")
+    (tmp_path / "log.csv").write_text('time,x\n0,"0,590"\n1,"2,590"\n')
+    with pytest.raises(FileFormatError, match=r"has '0,590' in line 2.*decimal=','"):
+        read(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("name", tables.REFUSED)
+@pytest.mark.parametrize("form", tables.FORMATS)
+def test_a_table_that_needs_a_choice_asks_for_it_in_one_line(name, form, tmp_path):
+    columns, options, message = tables.REFUSED[name]
+    path = tables.FORMATS[form](tmp_path / "log", columns)
+    with pytest.raises(OffbeatError, match=message) as error:
+        read(path, **options)
+    assert "\n" not in str(error.value)
+
+
+def test_rows_that_would_be_lost_are_merged_when_asked(tmp_path):
+    path = tables.write_csv(tmp_path / "log", {"time": [0, 0, 1, 1, 2, 2], "x": range(6)})
+    for choice, expected in (("last", [1, 3, 5]), ("first", [0, 2, 4]), ("mean", [0.5, 2.5, 4.5])):
+        assert read(path, duplicates=choice)[0].values[:, 0].tolist() == expected
+
+
+def test_equal_rows_of_one_stamp_lose_nothing(tmp_path):
+    twice = {"time": np.repeat(tables.TIMES, 2), "x": np.repeat(tables.X, 2)}
+    assert read(tables.write_csv(tmp_path / "log", twice))[0].values[:, 0].tolist() == (
+        tables.X.tolist()
+    )
+    parts = {"time": twice["time"], "x": twice["x"].copy(), "y": np.repeat(tables.Y, 2)}
+    parts["x"][::2], parts["y"][1::2] = np.nan, np.nan
+    dataset = read(tables.write_csv(tmp_path / "log", parts))
+    assert dataset[0].values.tolist() == np.column_stack([tables.X, tables.Y]).tolist()
+
+
+class TestAFolder:
+    def write(self, tmp_path, names, columns):
+        for i, name in enumerate(names):
+            own = {n: np.asarray(v) + i if n != "time" else v for n, v in columns[i].items()}
+            tables.write_csv(tmp_path / name, own)
+        return tmp_path
+
+    def test_of_files_with_the_same_channels_holds_an_episode_in_each(self, tmp_path):
+        names = [f"ep{i}" for i in (0, 1, 2, 10)]
+        folder = self.write(tmp_path, names, [{"time": tables.TIMES, **tables.XY}] * 4)
+        for path in (folder, [folder / f"{name}.csv" for name in names]):
+            dataset = read(path)
+            assert dataset.meta["labels"] == names  # 2 before 10
+            for i, trajectory in enumerate(dataset):
+                assert trajectory.values[:, 0] == pytest.approx(tables.X + i)
+        assert "4 files are read as episodes" in notes(dataset)
+
+    def test_of_files_with_different_channels_is_merged_by_their_times(self, tmp_path):
+        late = tables.TIMES + 0.005
+        columns = [{"time": tables.TIMES, "gyro": tables.X}, {"time": late, "speed": tables.Y}]
+        folder = self.write(tmp_path, ["imu", "odom"], columns)
+        (trajectory,) = dataset = read(folder, start="clock")
+        assert dataset.names == ("imu.gyro", "odom.speed")
+        assert trajectory.times == pytest.approx(np.sort([*tables.TIMES, *late]))
+        assert trajectory.values[::2, 0] == pytest.approx(tables.X)
+        assert trajectory.values[1::2, 1] == pytest.approx(tables.Y + 1)
+        assert np.isnan(trajectory.values[1::2, 0]).all()
+        assert len(read(folder, files="episodes")) == 2
+
+    def test_of_several_formats_asks_for_one(self, tmp_path):
+        columns = {"time": tables.TIMES, **tables.XY}
+        tables.write_csv(tmp_path / "a", columns)
+        tables.write_npz(tmp_path / "b", columns)
+        with pytest.raises(FileFormatError, match="several formats, csv, npz; name one"):
+            read(tmp_path)
+        assert len(read(tmp_path, format="csv")) == 1
+
+
+@pytest.mark.parametrize("form", logs.BAGS)
+class TestABag:
+    def test_with_a_list_of_messages_has_a_channel_per_element_that_is_chosen(self, form, tmp_path):
+        path = logs.motor_states(tmp_path, form)
+        dataset = read(path, fields=["motor_state"])
+        assert dataset.names == tuple(
+            f"motor_state[{i}].{n}" for i in range(3) for n in ("mode", "q", "dq")
+        )
+        for i in range(3):
+            column = dataset[0].values[:, dataset.names.index(f"motor_state[{i}].q")]
+            assert column == pytest.approx(logs.X + i, abs=1e-6)
+        assert read(path, fields=["motor_state[1].q"]).names == ("motor_state[1].q",)
+        default = read(path)
+        assert default.names == ("foot_force[0]", "foot_force[1]")
+        assert "motor_state (a list of messages, unless chosen" in notes(default)
+
+    def test_with_a_frame_of_two_parents_has_a_signal_for_each(self, form, tmp_path):
+        (trajectory,) = dataset = read(logs.transforms(tmp_path, form))
+        for start, parent, ahead in ((0, "odom", 0.0), (1, "map", 100.0)):
+            at = dataset.names.index(f"/tf/{parent}/base_link.transform.translation.x")
+            column = trajectory.values[:, at]
+            assert column[start::2] == pytest.approx(logs.X[start::2] + ahead)
+            assert np.isnan(column[1 - start :: 2]).all()
+        assert "/tf/base_link is given in several frames (map, odom)" in notes(dataset)
+
+    def test_with_one_parent_names_no_frame(self, form, tmp_path):
+        dataset = read(logs.transforms(tmp_path, form, ("odom", "odom")))
+        assert dataset.names[0] == "transform.translation.x"
+
+    def test_whose_frame_changes_has_a_signal_for_each(self, form, tmp_path):
+        (trajectory,) = dataset = read(logs.poses_in_two_frames(tmp_path, form))
+        odom, world = (
+            trajectory.values[:, dataset.names.index(f"/pose/{frame}.pose.position.x")]
+            for frame in ("odom", "map")
+        )
+        assert odom[:20] == pytest.approx(logs.X[:20])
+        assert world[20:] == pytest.approx(logs.X[20:])
+        assert np.isnan(odom[20:]).all()
+        assert np.isnan(world[:20]).all()
+
+    def test_whose_header_clocks_never_meet_takes_the_times_of_receipt(self, form, tmp_path):
+        (trajectory,) = dataset = read(logs.clocks_apart(tmp_path, form))
+        assert trajectory.times == pytest.approx(logs.TICKS / 1e9)
+        assert trajectory.known.all()
+        assert "the headers of /uptime and of /imu have no time in common" in notes(dataset)
+
+    def test_with_a_topic_that_cannot_be_read_has_the_others(self, form, tmp_path):
+        path = logs.with_a_foreign_topic(tmp_path, form)
+        for options in ({}, {"topics": ["/x"]}):
+            assert read(path, **options)[0].values[:, 0] == pytest.approx(logs.X)
+        assert "/wide is left out" in notes(read(path))
+        with pytest.raises(FileFormatError, match=r"topic /wide.*wstring"):
+            read(path, topics=["/wide"])
+
+    def test_of_a_folder_without_its_metadata_is_read(self, form, tmp_path):
+        path = logs.poses_in_two_frames(tmp_path, form)
+        whole = read(path)
+        if form != "bag":
+            (path / "metadata.yaml").unlink()
+            assert read(path).fingerprint() == whole.fingerprint()
+
+
+class TestHdf5:
+    @pytest.mark.parametrize("name", ["timestamps", "obs/timestamps", "obs/time", "stamp"])
+    def test_has_the_times_that_stand_beside_its_observations(self, name, tmp_path):
+        path = logs.robomimic(tmp_path / "log.hdf5", times=name)
+        options = [{}, {"time_column": name.removeprefix("obs/")}]
+        for given in options:
+            dataset = read(path, **given)
+            assert dataset[0].times == pytest.approx(logs.TICKS / 1e9)
+            assert dataset.names == ("eef[0]", "eef[1]", "action[0]", "action[1]")
+        with pytest.raises(
+            InputError, match="unknown time_column 'when', expected one of: actions"
+        ):
+            read(path, time_column="when")
+
+    def test_leaves_out_an_empty_demonstration_and_says_so(self, tmp_path):
+        dataset = read(logs.robomimic(tmp_path / "log.hdf5", empty=True))
+        assert dataset.meta["labels"] == ["demo_0", "demo_2"]
+        assert "demo_1 has no rows and is left out" in notes(dataset)
+        assert dataset.meta["time_unit"] == "s"
+
+    def test_with_a_filter_that_is_not_installed_names_it(self, tmp_path, monkeypatch):
+        path = tmp_path / "log.hdf5"
+        with h5py.File(path, "w") as file:
+            values = np.zeros((40, 2))
+            file.create_dataset("data/demo_0/obs/x", data=values, compression="gzip")
+            file["data/demo_0/actions"] = values
+        assert read(path)[0].rows == 40
+        monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)
+        with pytest.raises(FileFormatError, match="filter 'deflate', which is not installed"):
+            read(path)
+
+    def test_of_data_in_another_file_is_refused(self, tmp_path):
+        logs.robomimic(tmp_path / "other.hdf5")
+        path = tmp_path / "log.hdf5"
+        with h5py.File(path, "w") as file:
+            file["data/demo_0/actions"] = np.zeros((40, 2))
+            file["data/demo_0/obs/x"] = h5py.ExternalLink("other.hdf5", "data/demo_0/obs/eef")
+        with pytest.raises(FileFormatError, match="is a link to another file"):
+            read(path)
+
+    def test_of_a_shape_that_no_file_holds_is_refused(self, tmp_path):
+        path = tmp_path / "log.hdf5"
+        with h5py.File(path, "w") as file:
+            file.create_dataset("data/demo_0/obs/x", (10**11, 2), "f8", chunks=(1024, 2))
+            file["data/demo_0/actions"] = np.zeros((40, 2))
+        with pytest.raises(FileFormatError, match="far more than the file of"):
+            read(path)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+class TestLeRobot:
+    def test_reads_features_whose_names_only_begin_like_others(self, version, tmp_path):
+        dataset = read(logs.lerobot(tmp_path / "set", version))
+        for k, name in enumerate(("task_space_position", "actions_executed", "language_level")):
+            column = dataset[0].values[:, dataset.names.index(name)]
+            assert column == pytest.approx(logs.X + k, abs=1e-6)
+            assert dataset.roles[dataset.names.index(name)] == "state"
+        assert "next.reward, complementary_info.force" in notes(dataset)
+
+    def test_refuses_stamps_that_are_all_0(self, version, tmp_path):
+        path = logs.lerobot(tmp_path / "set", version, zero_stamps=True)
+        with pytest.raises(FileFormatError, match="rows have the time stamp of another row"):
+            read(path)
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"data_path": "../outside.parquet"}, "expected one inside of"),
+            ({"data_path": "/etc/passwd"}, "expected one inside of"),
+            ({"data_path": "data/\0.parquet"}, "expected one inside of"),
+            ({"data_path": "{episode_index:999999999d}"}, "has the pattern"),
+            ({"data_path": "{episode_index.__class__}"}, "has the pattern"),
+            ({"chunks_size": 0}, "0 in a folder, expected some"),
+            ({"chunks_size": -1}, "-1 in a folder"),
+            ({"total_episodes": -1}, "-1 episodes"),
+            ({"fps": float("inf")}, "says inf fps"),
+            ({"features": {"x": {"dtype": "float32", "shape": [-3]}}}, "has shape"),
+            ({"features": {"x": {"dtype": "float32", "shape": [10**30]}}}, "has shape"),
+            ({"features": {"x": {"dtype": "float32", "shape": "abc"}}}, "not the info.json"),
+            ({"features": [1]}, "not the info.json"),
+        ],
+    )
+    def test_stays_inside_its_folder_and_refuses_sizes_that_cannot_be(
+        self, version, changes, message, tmp_path
+    ):
+        path = logs.changed_info(logs.lerobot(tmp_path / "set", version), **changes)
+        with pytest.raises(FileFormatError, match=message) as error:
+            read(path)
+        assert "\n" not in str(error.value)
+        assert str(error.value).isprintable()
+
+
+def test_a_million_million_episodes_are_those_on_disk(tmp_path):
+    path = logs.changed_info(logs.lerobot(tmp_path / "set", "v2.1"), total_episodes=10**12)
+    assert len(read(path)) == 2  # as episodes.jsonl says
+    (path / "meta" / "episodes.jsonl").unlink()
+    with pytest.raises(FileFormatError, match="says 1000000000000 episodes, and there are 2 files"):
+        read(path)
+
+
+IMU = "#stamp wx wy wz ax ay az host\n"
+POSE = "# timestamp tx ty tz qw qx qy qz\n"
+
+
+def test_eight_numbers_are_a_pose_only_by_their_header_or_their_quaternion(tmp_path):
+    path = tmp_path / "log.txt"
+    rows = (f"{t} {x} 0 0 0.5 0 9.81 {t}\n" for t, x in zip(tables.TIMES, tables.X, strict=True))
+    path.write_text(IMU + "".join(rows))
+    dataset = read(path)
+    assert dataset.meta["format"] == "csv"
+    assert dataset.names == ("wx", "wy", "wz", "ax", "ay", "az", "host")
+    assert (dataset[0].values[:, 5] == 9.81).all()
+    path.write_text(POSE + "0 1 2 3 1 0 0 0\n1 4 5 6 0.6 0.8 0 0\n")
+    dataset = read(path)
+    assert dataset.meta["format"] == "tum"
+    assert dataset.names[3:] == ("qx", "qy", "qz", "qw")
+    assert dataset[0].values[:, 3:].tolist() == [[0, 0, 0, 1], [0.8, 0, 0, 0.6]]
+    path.write_text("0 1 2 3 4 5 6 7\n1 4 5 6 7 8 9 1\n")
+    with pytest.raises(FileFormatError, match=r"has no header.*column_names="):
+        read(path)
+    path.write_text(POSE.replace("qw qx qy qz", "a b c d") + "0 1 2 3 4 5 6 7\n")
+    with pytest.raises(FileFormatError, match=r"names its columns .* read it with format=csv"):
+        read(path, format="tum")
