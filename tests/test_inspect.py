@@ -110,6 +110,7 @@ def test_the_command_of_the_advice_trains(damaged, tmp_path, capsys):
     for reason in told["advice"]["reasons"]:
         assert f"offbeat: {reason}" in said
     kept = json.loads((tmp_path / "run" / "reader.json").read_text())
+    assert kept.pop("found") == {"time_unit": "us"}  # by the numbers, for other logs
     assert kept == {"outliers": "mask", "repeated": "mask", "angles": ["yaw"]}
     predictions = tmp_path / "predictions.csv"
     assert main(["predict", str(tmp_path / "run"), str(damaged), str(predictions)]) == 0

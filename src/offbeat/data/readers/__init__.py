@@ -275,6 +275,8 @@ def _renamed(options: dict[str, Any], reader: Reader) -> dict[str, Any]:
 def reader_of(path: Path) -> Reader:
     """The reader of a file or folder that exists, by its suffix and content.
 
+    Of a folder of files that are read together, it is the reader of these files.
+
     Raises:
         FileFormatError: no reader supports it.
     """
@@ -284,6 +286,9 @@ def reader_of(path: Path) -> Reader:
         if reader.recognises is not None and reader.recognises(path):
             return reader
     if suffix == FOLDER:
+        inside = _files_of(path, None)
+        if inside:
+            return reader_of(inside[0])
         known = ", ".join(reader.name for reader in fitting) or "none"
         raise FileFormatError(
             f"{path} is a folder of no known format, expected one of: {known}; name the file "
