@@ -134,6 +134,16 @@ def test_what_cannot_be_trained_on_is_inspected_all_the_same(tmp_path, capsys):
     assert "nothing to learn" in capsys.readouterr().err
 
 
+def test_a_data_set_of_ours_is_finished_and_the_advice_says_so(tmp_path, capsys):
+    trajectories = ob.Trajectory(np.arange(30) / 10, np.random.default_rng(0).normal(size=(30, 2)))
+    path = tmp_path / "ours.parquet"
+    ob.save(ob.Dataset((trajectories,) * 10), path)
+    assert main(["inspect", str(path), "--run", "run", "--json"]) == 0
+    advice = json.loads(capsys.readouterr().out)["advice"]
+    assert advice["command"] == ["offbeat", "train", str(path), "run"]
+    assert "taken as it is" in advice["reasons"][0]
+
+
 def test_outliers_copies_and_counters_are_told_in_the_table_and_in_sentences(tmp_path, capsys):
     rows = np.arange(300)
     wave = np.sin(0.1 * rows)

@@ -14,6 +14,7 @@ from offbeat.config import SplitConfig
 from offbeat.data.plan import find_sensors, plan, prepare
 from offbeat.data.redundant import Redundant
 from offbeat.data.splits import split_in_blocks
+from offbeat.data.tasks import draw_tasks
 
 
 @pytest.fixture(scope="module", params=ODD_LOGS)
@@ -52,6 +53,18 @@ def test_the_split_has_windows_in_every_part_and_none_spans_two(odd):
         assert (chosen.split.blocks > 1) == (name != "short"), "several places, if there is room"
         for part in pieces[1:]:
             assert len(part) >= chosen.split.blocks
+
+
+def test_tasks_can_be_drawn_from_the_parts(odd):
+    _, dataset, chosen = odd
+    for part in ob.apply_split(prepare(dataset, chosen), chosen.whole):
+        tasks = draw_tasks(part, chosen.tasks, 40)
+        states = [c for c, role in enumerate(tasks.roles) if role == "state"]
+        kept = [t.observed[:, states].sum() for t in tasks]
+        assert sum(kept) > 0
+        longest = max(float(t.times[-1] - t.times[0]) for t in tasks)
+        assert longest <= chosen.window_s + 1e-9
+        assert {kind for kind, _, _ in tasks.meta["tasks"]} == {"logged", "silence", "cut"}
 
 
 def test_the_same_is_chosen_from_a_file_and_the_command_says_nothing_more(odd, tmp_path, capsys):

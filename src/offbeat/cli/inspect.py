@@ -8,6 +8,12 @@ from typing import Any
 from offbeat.cli.common import say, without_warnings
 from offbeat.errors import InputError, one_of
 
+_FINISHED = (
+    "a data set in the format of Offbeat is taken as it is: nothing is cleaned or left out",
+    "whole trajectories train, validate and test; no value is masked unless "
+    "--split.observed_fraction is given",
+)
+
 
 def inspect_command(
     data: Path,
@@ -25,7 +31,7 @@ def inspect_command(
         run: folder of the run in the command that is printed.
         json: print everything as JSON.
     """
-    from offbeat.data.advice import advise
+    from offbeat.data.advice import Advice, advise
     from offbeat.data.inspection import inspect
     from offbeat.data.readers import READERS, read
     from offbeat.files import writable
@@ -40,7 +46,11 @@ def inspect_command(
     known = READERS[inspection.format].options if inspection.format in READERS else ()
     result = inspection.to_dict()
     try:
-        advice = advise(dataset, str(data), str(run), reader=reader, known=known)
+        advice = (
+            advise(dataset, str(data), str(run), reader=reader, known=known)
+            if "cleaning" in dataset.meta
+            else Advice(("offbeat", "train", str(data), str(run)), _FINISHED)
+        )
         result["advice"] = {"command": list(advice.command), "reasons": list(advice.reasons)}
         trained = ["To train on it:", "", f"  {str(advice).replace(chr(10), chr(10) + '  ')}", ""]
         trained += ["which chooses:", *(f"  - {reason}" for reason in advice.reasons)]

@@ -18,6 +18,7 @@ from offbeat.data.redundant import Redundant, find_redundant, leave_out
 from offbeat.data.representative import differences, unlikeness
 from offbeat.data.scaler import clipped
 from offbeat.data.splits import apply_split
+from offbeat.data.tasks import TaskConfig
 from offbeat.data.trajectory import STATE, Dataset, known_values
 from offbeat.data.transforms import Angle, Transforms, full_turn, is_angle_unit, lowest_of
 from offbeat.errors import InputError
@@ -70,6 +71,16 @@ class Plan:
     window_s: float
     split: SplitConfig
     notes: tuple[str, ...]
+
+    @property
+    def tasks(self) -> TaskConfig:
+        """How tasks are drawn that are like what will be asked."""
+        return TaskConfig(self.horizon_s, self.typical_gap_s, self.window_s, self.sensors)
+
+    @property
+    def whole(self) -> SplitConfig:
+        """The split without windows and masks, for tasks to be drawn from its parts."""
+        return _whole(self.split)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form."""
