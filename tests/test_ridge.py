@@ -9,7 +9,8 @@ import pytest
 
 import offbeat as ob
 from offbeat.baselines import cross_fitted, fit_baseline, folds_of
-from offbeat.baselines.held_out import held_out_ridge
+from offbeat.baselines.held_out import Products, held_out_ridge
+from offbeat.baselines.ridge_fill import backwards
 from offbeat.data.tasks import TaskConfig, draw_tasks, take_tasks
 
 GAP = 0.01
@@ -215,3 +216,108 @@ def test_cross_fitted_predictions_are_those_of_a_fit_without_the_source():
         others = fit_baseline("ridge", take_tasks(tasks, np.flatnonzero(fold != k)))
         for i in np.flatnonzero(fold == k):
             assert found[i] == pytest.approx(others.predict(tasks[i : i + 1])[0])
+
+
+def test_ridge_of_parts_of_products_is_that_of_the_examples():
+    x, y, groups = problem()
+    products = Products.of(x, y, groups)
+    part, spread = np.array([0, 2, 5]), np.array([1.0, 4.0, 0.5])
+    first = products.part(part, spread).solve()
+    assert first == pytest.approx(held_out_ridge(x[:, part] / spread, y, groups), rel=1e-9)
+    weights = np.zeros((12, 2))
+    weights[part] = first / spread[:, None]
+    left = held_out_ridge(x, y - x @ weights, groups)
+    assert products.left(weights).solve() == pytest.approx(left, rel=1e-6, abs=1e-9)
+
+
+# --- fills ----------------------------------------------------------------------------------------
+
+
+def gapped(
+    dataset: ob.Dataset, length: int, seed: int, channels: tuple[int, ...] | None = None
+) -> ob.Dataset:
+    """Each trajectory with one gap of some rows, anywhere but near its ends."""
+    random = np.random.default_rng(seed)
+    tasks = []
+    for t in dataset:
+        observed = t.observed.copy()
+        first = random.integers(6, t.rows - length - 6)
+        hidden = slice(None) if channels is None else list(channels)
+        observed[first : first + length, hidden] = False
+        tasks.append(replace(t, observed=observed))
+    return ob.Dataset(tuple(tasks))
+
+
+def missed(baseline: ob.baselines.Baseline, test: ob.Dataset, channel: int = 0) -> float:
+    """Root mean square error of the hidden values of a channel."""
+    errors = [
+        (t.values - p)[~t.observed[:, channel], channel]
+        for t, p in zip(test, baseline.predict(test), strict=True)
+    ]
+    return rms(np.concatenate(errors))
+
+
+def test_cubic_polynomials_are_filled():
+    random = np.random.default_rng(0)
+    time = np.linspace(-1, 1, 30)
+    data = ob.Dataset(
+        tuple(
+            ob.Trajectory(GAP * np.arange(30), np.polyval(random.standard_normal(4), time)[:, None])
+            for _ in range(300)
+        )
+    )
+    fitted = fit_baseline("ridge_fill", gapped(data[:250], 4, seed=1))
+    test = gapped(data[250:], 4, seed=2)
+    curve = missed(fit_baseline("pchip", test), test)
+    assert missed(fitted, test) < 0.02 * curve
+
+
+def moving(count: int, seed: int) -> ob.Dataset:
+    """A position and its velocity: sums of sines."""
+    random = np.random.default_rng(seed)
+    time = GAP * np.arange(80)
+    made = []
+    for _ in range(count):
+        speed, phase = random.uniform(5, 25, 3), random.uniform(0, 6, 3)
+        angle = np.outer(time, speed) + phase
+        made.append(
+            ob.Trajectory(
+                time, np.stack([np.sin(angle).sum(1), (speed * np.cos(angle)).sum(1)], -1)
+            )
+        )
+    return ob.Dataset(tuple(made))
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_a_position_is_filled_from_its_velocity_and_the_other_way_round(channel):
+    train = gapped(moving(300, seed=0), 15, seed=1, channels=(channel,))
+    test = gapped(moving(100, seed=2), 15, seed=3, channels=(channel,))
+    curve = missed(fit_baseline("pchip", train), test, channel)
+    assert missed(fit_baseline("ridge_fill", train), test, channel) < 0.05 * curve
+
+
+def test_a_random_walk_is_filled_by_a_line():
+    random = np.random.default_rng(0)
+    data = ob.Dataset(
+        tuple(
+            ob.Trajectory(GAP * np.arange(60), np.cumsum(random.standard_normal((60, 2)), axis=0))
+            for _ in range(500)
+        )
+    )
+    fitted = fit_baseline("ridge_fill", gapped(data[:400], 9, seed=1))
+    test = gapped(data[400:], 9, seed=2)
+    assert missed(fitted, test) < 1.01 * missed(fit_baseline("linear", test), test)
+
+
+def test_outside_all_observations_a_fill_is_a_forecast_in_that_direction():
+    tasks = cut(second_order(60, seed=0), 60)
+    fitted = fit_baseline("ridge_fill", tasks)
+    test = cut(second_order(3, seed=1), 50)
+    for t, p, after in zip(test, fitted.predict(test), fitted.forward.predict(test), strict=True):
+        assert np.array_equal(p[50:], after[50:])
+        assert np.array_equal(p[:50], t.values[:50])
+    mirrored = backwards(test)
+    for p, before in zip(
+        fitted.predict(mirrored), fitted.backward.predict(backwards(mirrored)), strict=True
+    ):
+        assert np.array_equal(p[:20], before[::-1][:20])

@@ -20,6 +20,7 @@ from offbeat.baselines.folds import cross_fitted, folds_of
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.kalman_channels import KalmanLong, KalmanShort, Smoother
 from offbeat.baselines.ridge import Ridge
+from offbeat.baselines.ridge_fill import RidgeFill
 from offbeat.baselines.simple import (
     ConstantVelocity,
     DampedSlope,
@@ -46,6 +47,7 @@ __all__ = [
     "Mean",
     "Pchip",
     "Ridge",
+    "RidgeFill",
     "RunningMean",
     "Smoother",
     "causal_baselines",

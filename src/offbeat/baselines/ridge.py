@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import BASELINES, Array, CausalBaseline, State, namespace, padded
-from offbeat.baselines.folds import folds_of
+from offbeat.baselines.base import (
+    BASELINES,
+    Array,
+    CausalBaseline,
+    State,
+    namespace,
+)
+from offbeat.baselines.examples import FURTHEST, Examples, examples_of, likeness
 from offbeat.baselines.held_out import held_out_ridge
 from offbeat.baselines.history import AgeBins, History, longest_age, typical_gap
 from offbeat.baselines.simple import as_kind
@@ -23,18 +28,6 @@ AVERAGES = 2
 
 FOLLOWED = 16
 """Most channels whose motion since a channel was observed is followed."""
-
-STATES, CELLS = 50_000, 1_000_000
-"""Most states of the tasks that a fit uses, and most of them times channels."""
-
-EXAMPLES = 6_000
-"""Most examples of a channel in a bin."""
-
-FOLDS = 4
-"""Groups of source trajectories that penalties are chosen on."""
-
-FURTHEST = 10.0
-"""Largest motion of a channel since an observation, in units of its scale."""
 
 
 class Ridge(CausalBaseline):
@@ -62,6 +55,9 @@ class Ridge(CausalBaseline):
     """
 
     flexible = True
+
+    most_states: ClassVar[int] = 50_000  # of the tasks, that a fit uses
+    most_examples: ClassVar[int] = 6_000  # of a channel in a bin
 
     edges: Array  # (bins,) s, of AgeBins
     averages: Array  # (averages,) s, time constants
@@ -140,7 +136,7 @@ class Ridge(CausalBaseline):
         like = state["count"]
         xp = namespace(like)
         features = self._limited(self.features(state))
-        at, relative = self._placed(History.age(state, time))
+        at, relative = self.placed(History.age(state, time))
         own = _own(features, self.moved(state), relative)
         channel = np.arange(len(self.mean)) if xp is np else xp.arange(len(self.mean))
         change = (own * as_kind(self.own_weight, like)[at, channel]).sum(-1)
@@ -165,7 +161,7 @@ class Ridge(CausalBaseline):
         flat = namespace(flat).clip(flat, low, high) / as_kind(self.spread, flat)
         return flat.reshape(features.shape)
 
-    def _placed(self, age: Any) -> tuple[Any, Any]:
+    def placed(self, age: Any) -> tuple[Any, Any]:
         """Which weights are for an age, and the age over the middle of its bin."""
         xp = namespace(age)
         bins = AgeBins(self.edges)
@@ -187,13 +183,13 @@ class Ridge(CausalBaseline):
         gap, longest = typical_gap(tasks), longest_age(tasks)
         self.edges = AgeBins.of(tasks).edges
         self.averages = np.geomspace(4 * gap, max(longest, 8 * gap), AVERAGES)
-        likeness = _likeness(tasks)
-        order = np.argsort(-likeness, axis=1, kind="stable")
+        alike = likeness(tasks)
+        order = np.argsort(-alike, axis=1, kind="stable")
         self.followed = np.ascontiguousarray(order[:, 1 : FOLLOWED + 1])
-        found = _examples(self, tasks)
+        found = examples_of(self, tasks)
         self._measure(found.features)
         features = self._limited(found.features).astype(np.float32)
-        self._solve(found, features, likeness)
+        self._solve(found, features, alike)
         known = [np.where(t.known, t.values, np.nan) for t in tasks]
         every = np.concatenate([*known, np.where(np.isfinite(self.mean), self.mean, 0.0)[None]])
         low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
@@ -207,7 +203,7 @@ class Ridge(CausalBaseline):
         spread = np.clip(flat, *self.limits).std(axis=0, dtype=np.float64)
         self.spread = np.where(spread > 0, spread, 1.0)
 
-    def _solve(self, found: Examples, features: Array, likeness: Array) -> None:
+    def _solve(self, found: Examples, features: Array, alike: Array) -> None:
         bins, channels = len(self.edges), features.shape[1]
         size = 2 + 2 * features.shape[2] + self.followed.shape[1]
         self.own_weight = np.zeros((2 * bins + 1, channels, size))
@@ -216,9 +212,9 @@ class Ridge(CausalBaseline):
             if bins <= b < 2 * bins:
                 self.own_weight[b] = self.own_weight[b - bins]
                 self.weight[b] = self.weight[b - bins]
-            for group, rows in found.together(b):
+            for group, rows in found.together(b, self.most_examples):
                 at = found.state[rows]
-                columns = self._columns(group, likeness, features.shape[2])
+                columns = self._columns(group, alike, features.shape[2])
                 shared = self.shared(features[at])[:, columns].astype(np.float64)
                 left = np.empty((len(rows), len(group)))
                 for i, c in enumerate(group):
@@ -234,98 +230,13 @@ class Ridge(CausalBaseline):
                     shared, left, found.fold[at]
                 )
 
-    def _columns(self, group: list[int], likeness: Array, each: int) -> NDArray[np.int64]:
+    def _columns(self, group: list[int], alike: Array, each: int) -> NDArray[np.int64]:
         """The shared features that predict these channels: of 32 channels, of less in wide logs."""
-        channels = len(likeness)
+        channels = len(alike)
         most = max(len(group), int(np.clip(1000 // channels, 12, 32)))
-        inputs = np.sort(np.argsort(-likeness[group].max(axis=0), kind="stable")[:most])
+        inputs = np.sort(np.argsort(-alike[group].max(axis=0), kind="stable")[:most])
         columns = (inputs[:, None] * each + np.arange(each)).ravel()
         return np.append(columns, channels * each)
-
-
-@dataclass(frozen=True, eq=False)
-class Examples:
-    """States of tasks, and what later rows were.
-
-    Attributes:
-        features: (states, channels, features) of `Ridge.features`.
-        moved: (states, channels, followed).
-        fold: (states,) group of trajectories.
-        state: (examples,) the state that an example predicts from.
-        at: (examples, channels) which weights it uses; -1 where it is no example.
-        relative: (examples, channels) age over the middle of its bin.
-        change: (examples, channels) since the last observation, in units of the scale.
-    """
-
-    features: Array
-    moved: Array
-    fold: NDArray[np.int64]
-    state: NDArray[np.int64]
-    at: NDArray[np.int8]
-    relative: Array
-    change: Array
-
-    def together(self, b: int) -> list[tuple[list[int], NDArray[np.int64]]]:
-        """Channels with the same examples of a bin, and at most `EXAMPLES` of these."""
-        groups: dict[bytes, list[int]] = {}
-        here = self.at == b
-        for c in range(here.shape[1]):
-            groups.setdefault(np.packbits(here[:, c]).tobytes(), []).append(c)
-        found = []
-        for group in groups.values():
-            rows = np.flatnonzero(here[:, group[0]])
-            if len(rows) > EXAMPLES:
-                rows = np.sort(np.random.default_rng(b).choice(rows, EXAMPLES, replace=False))
-            if len(rows):
-                found.append((group, rows))
-        return found
-
-
-def _examples(baseline: Ridge, tasks: Dataset) -> Examples:
-    """Some states before a row; each predicts that row, and two later ones as if cut off.
-
-    The distance of the later ones is log-uniform.
-    """
-    random = np.random.default_rng(0)
-    fraction = min(STATES, CELLS / tasks.channels) / sum(t.rows for t in tasks)
-    folds = folds_of(tasks, FOLDS)
-    states: list[tuple[NDArray[Any], ...]] = []
-    reads: list[tuple[NDArray[Any], ...]] = []
-    first = count = 0
-    for rows in padded(tasks):
-        lengths = np.array(rows.lengths)
-        state = baseline.start(np.zeros((len(lengths), tasks.channels)))
-        for i in range(int(lengths.max())):
-            chosen = np.flatnonzero((random.random(len(lengths)) < fraction) & (i < lengths))
-            part = {name: array[chosen] for name, array in state.items()}
-            last = History.last(part, baseline.mean)
-            features, moved = baseline.features(part), baseline.moved(part)
-            fold = folds[first + chosen]
-            states.append((features.astype(np.float32), moved.astype(np.float32), fold))
-            longest = lengths[chosen] - 1 - i
-            for draw in (np.zeros(len(chosen)), *random.random((2, len(chosen)))):
-                to = i + np.minimum(((longest + 2.0) ** draw).astype(int) - 1, longest)
-                age = History.age(part, rows.times[chosen, to, None])
-                at, relative = baseline._placed(age)
-                counted = rows.known[chosen, to] & (relative > 0.2)
-                counted &= (age <= baseline.edges[-1]) | np.isinf(age)
-                change = (rows.values[chosen, to] - last) / baseline.scale
-                reads.append(
-                    (
-                        count + np.arange(len(chosen)),
-                        np.where(counted, at, -1).astype(np.int8),
-                        relative.astype(np.float32),
-                        np.clip(change, -FURTHEST, FURTHEST).astype(np.float32),
-                    )
-                )
-            count += len(chosen)
-            time = rows.times[:, i, None]
-            state = baseline.observe(state, time, rows.values[:, i], rows.observed[:, i])
-        first += len(lengths)
-    return Examples(
-        *(np.concatenate(parts) for parts in zip(*states, strict=True)),
-        *(np.concatenate(parts) for parts in zip(*reads, strict=True)),
-    )
 
 
 def _own(features: Any, moved: Any, relative: Any) -> Any:
@@ -334,22 +245,6 @@ def _own(features: Any, moved: Any, relative: Any) -> Any:
     relative = relative[..., None]
     one = xp.ones_like(relative)
     return xp.concatenate([relative, one, relative * features, features, moved], -1)
-
-
-def _likeness(tasks: Dataset) -> Array:
-    """(channels, channels) absolute correlation of how the last values move; 2 with itself."""
-    product = np.zeros((tasks.channels, tasks.channels))
-    for t in tasks:
-        row = np.maximum.accumulate(np.where(t.observed, np.arange(t.rows)[:, None], 0), axis=0)
-        seen = np.logical_or.accumulate(t.observed, axis=0)
-        held = np.take_along_axis(np.where(t.observed, t.values, 0.0), row, axis=0)
-        moved = np.where(seen[:-4], held[4:] - held[:-4], 0.0)
-        product += moved.T @ moved
-    spread = np.sqrt(np.diag(product))
-    likeness = np.abs(product) / np.where(spread > 0, spread, 1.0)
-    likeness = likeness / np.where(spread > 0, spread, 1.0)[:, None]
-    np.fill_diagonal(likeness, 2.0)
-    return likeness
 
 
 def _index(index: NDArray[np.int64], xp: Any) -> Any:
