@@ -9,6 +9,7 @@ import pytest
 from model_helpers import small_model
 
 import offbeat as ob
+from offbeat.answers.blend import fit_blend
 from offbeat.data.outliers import mask_outliers
 from offbeat.data.redundant import Redundant, find_redundant, leave_out
 from offbeat.data.transforms import Transforms
@@ -214,3 +215,16 @@ def test_training_and_scores_leave_the_channels_out():
     assert [line.split()[1:3] for line in table.splitlines()[1:7]] == [
         ["-", "0"], ["-", "18"], ["-", "18"], ["-", "0"], ["-", "0"], ["-", "0"],
     ]  # fmt: skip
+
+
+def test_intervals_of_constants_have_no_width_and_those_of_copies_are_those_of_the_original():
+    train, validation, _ = ob.split_in_time(prepared())
+    blend = fit_blend(train, validation, count=20)
+    raw = robot()
+    for answer in (ob.predict(blend, raw)[0], ob.impute(blend, raw, rate_hz=300)[0]):
+        low, high = answer.interval(0.9)
+        width = dict(zip(answer.names, (high - low).T, strict=True))
+        new = ~answer.observed[:, 3]
+        assert (width["mode"] == 0).all()
+        assert np.array_equal(width["rate_again"][new], width["rate"][new])
+        assert (width["height"][~answer.observed[:, 1]] > 0).all()

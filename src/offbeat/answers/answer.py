@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,6 +91,28 @@ class Answer(Trajectory):
             key=None if self.key is None else self.key[rows],
             unit=None if self.unit is None else self.unit[rows],
             beyond=None if self.beyond is None else self.beyond[rows],
+        )
+
+    def given_back(self, constants: Mapping[int, float], copies: Mapping[int, int]) -> Answer:
+        """As `Trajectory.given_back`: intervals of constants have no width, copies those of theirs.
+
+        Args:
+            constants: position of a channel, and its value.
+            copies: position of a channel, and of the one that it is a copy of.
+        """
+        answer = super().given_back(constants, copies)
+        assert isinstance(answer, Answer)
+        source = np.arange(self.channels)
+        for channel, of in copies.items():
+            source[channel] = of
+        still = np.isin(source, list(constants))
+        widths = self.widths
+        return replace(
+            answer,
+            widths=None if widths is None else replace(widths, table=widths.table[:, source]),
+            key=None if self.key is None else self.key[:, source],
+            unit=None if self.unit is None else np.where(still, 0.0, self.unit[:, source]),
+            beyond=None if self.beyond is None else self.beyond[:, source] & ~still,
         )
 
     def select(self, index: Sequence[int]) -> Answer:

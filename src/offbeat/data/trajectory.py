@@ -197,6 +197,22 @@ class Trajectory:
             roles=tuple(self.roles[i] for i in order),
         )
 
+    def given_back(self, constants: Mapping[int, float], copies: Mapping[int, int]) -> Trajectory:
+        """The trajectory with the values of channels that a model was not given.
+
+        Args:
+            constants: position of a channel, and its value.
+            copies: position of a channel, and of the one that it is a copy of.
+        """
+        if not constants and not copies:
+            return self
+        values = self.values.copy()
+        for channel, constant in constants.items():
+            values[:, channel] = constant
+        for channel, source in copies.items():
+            values[:, channel] = values[:, source]
+        return replace(self, values=hand_over(values))
+
 
 def _described(
     trajectory: Trajectory, channels: int, where: str

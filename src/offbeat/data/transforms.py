@@ -270,11 +270,10 @@ class Transforms:
             for four in self.quaternions:
                 columns = [answer.names.index(name) for name in four]
                 values[:, columns] = unit_quaternions(values[:, columns])
-            for name, constant in self.constants.items():
-                values[:, answer.names.index(name)] = constant
-            for name, of in self.copies.items():
-                values[:, answer.names.index(name)] = values[:, answer.names.index(of)]
-            results.append(replace(answer, values=values))
+            at_of = answer.names.index
+            constants = {at_of(name): value for name, value in self.constants.items()}
+            copies = {at_of(name): at_of(of) for name, of in self.copies.items()}
+            results.append(replace(answer, values=values).given_back(constants, copies))
         return replace(predicted, trajectories=tuple(results))
 
     def _without(self, done: Transforms) -> Transforms:
