@@ -354,9 +354,58 @@ def test_a_backward_model_corrects_the_same_baseline_fitted_to_reversed_tasks():
     assert not np.array_equal(back.base.factor, model.base.factor)
 
 
-def test_an_anchored_model_cannot_correct_a_baseline():
-    with pytest.raises(ob.InputError, match="cannot correct a baseline"):
-        corrected("last_value", name="anchored_ode_gru_d")
+def test_an_anchored_model_is_joined_with_the_baseline_by_a_gate_per_time_and_channel():
+    model = corrected("damped_slope", name="anchored_ode_gru_d").double()
+    bins = len(model.bins)
+    task = draw_tasks(VALIDATION, TASKS, 5, seed=3)
+    batch = model.batch(task)
+    base, alone = model.predicted_by_base(batch), model.inner(batch).mean
+    with torch.no_grad():
+        model.gate.fill_(-50.0)
+    assert torch.equal(model(batch).mean, base)
+    with torch.no_grad():
+        model.gate.fill_(50.0)
+    torch.testing.assert_close(model(batch).mean, alone)
+    with torch.no_grad():
+        model.gate.fill_(-50.0)
+        model.gate[bins - 1, 1] = 0.0  # the longest times of the second channel
+    expected = base.clone()
+    at = cells(batch, model.bins)[..., 1] == bins - 1
+    expected[..., 1][at] = (0.5 * (base + alone))[..., 1][at]
+    torch.testing.assert_close(model(batch).mean, expected)
+
+
+def test_a_gate_closes_where_the_baseline_is_exact_and_opens_where_it_is_wrong():
+    """Lines, which constant velocity continues exactly, and waves that it does not follow."""
+    times = 0.05 * np.arange(120)
+    random = np.random.default_rng(0)
+    lines = ob.Dataset(
+        tuple(
+            ob.Trajectory(
+                times,
+                np.column_stack(
+                    [random.uniform(-1, 1) * times, np.sin(6 * times + random.uniform(0, 6))]
+                ),
+            )
+            for _ in range(6)
+        )
+    )
+    model = corrected("constant_velocity", lines, name="anchored_ode_gru_d", hidden_size=8)
+    config = ob.TrainConfig(tasks=TASKS, epochs=10, tasks_per_epoch=160, learning_rate=0.02)
+    ob.fit(model, lines, lines, config, progress=False)
+    line, wave = torch.sigmoid(model.gate.detach())[len(model.bins) - 1].tolist()
+    start = 1 / (1 + math.exp(-1))
+    assert line < start < wave
+
+
+def test_a_gated_model_is_saved_and_read(tmp_path):
+    model = corrected("damped_slope", name="anchored_ode_gru_d")
+    with torch.no_grad():
+        model.gate.uniform_(-2, 2, generator=torch.Generator().manual_seed(0))
+    model.save(tmp_path / "model")
+    loaded = ob.load_model(tmp_path / "model")
+    for a, b in zip(ob.predict(model, VALIDATION), ob.predict(loaded, VALIDATION), strict=True):
+        assert np.array_equal(a.values, b.values)
 
 
 def test_cells_are_the_bins_that_baselines_use():

@@ -59,6 +59,11 @@ class Candidate:
         return f"{self.model.name}{base}-{self.model.hidden_size}-{self.learning_rate:g}"
 
 
+def _gated(hidden: int, units: int, rate: float) -> Candidate:
+    config = ModelConfig("anchored_ode_gru_d", hidden_size=hidden, field_units=(units, units))
+    return Candidate(config, rate, "damped_slope")
+
+
 def _corrector(hidden: int, units: int, rate: float) -> Candidate:
     config = ModelConfig(
         "ode_gru_d",
@@ -70,19 +75,12 @@ def _corrector(hidden: int, units: int, rate: float) -> Candidate:
     return Candidate(config, rate, "damped_slope")
 
 
-def _anchored(hidden: int, units: int, rate: float) -> Candidate:
-    return Candidate(
-        ModelConfig("anchored_ode_gru_d", hidden_size=hidden, field_units=(units, units)), rate
-    )
-
-
 CANDIDATES = (
-    _corrector(32, 64, 0.003),
-    _anchored(32, 64, 0.003),
-    _corrector(16, 32, 0.003),
-    _corrector(64, 64, 0.003),
-    _anchored(16, 32, 0.003),
-    _corrector(32, 64, 0.001),
+    _gated(32, 64, 0.006),
+    _gated(16, 32, 0.006),
+    _corrector(32, 64, 0.006),
+    _gated(32, 64, 0.002),
+    _gated(64, 64, 0.004),
 )
 """Candidates in the order in which they are tried; where the budget is short, the first ones."""
 

@@ -1,8 +1,13 @@
-"""Models that correct a baseline: prediction = base + scale * output of the model.
+"""Models that correct a baseline, which is a causal predictor in closed form.
 
-The base is a causal baseline in closed form, the scale its typical error for the channel and the
-time since its last observation. So the model's output is a number of about 1 for any channel and
-any time, and where it is 0 the prediction is that of the base: training starts there.
+A model with a decoder gives the correction: prediction = base + scale * output. The scale is the
+typical error of the base for the channel and the time since its last observation. So the output is
+a number of about 1 for any channel and any time, and training starts at 0, with the base itself.
+
+An anchored model predicts the channels, and a gate joins both: prediction = base + gate * (output -
+base). The gate, from 0 to 1, is learned per channel and time since observation, together with the
+model. Where the base is hard to beat, such as one row after an observation, the gate closes, and
+the model is not trained on errors that it cannot reduce.
 """
 
 from __future__ import annotations
@@ -14,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from offbeat.baselines.base import BASELINES, CausalBaseline, Rows, stepped
 from offbeat.baselines.errors import CLIPPED, ErrorTable, cells
@@ -27,6 +32,9 @@ from offbeat.errors import InputError
 from offbeat.models.base import BaseModel, DataInfo
 from offbeat.models.model import Model
 from offbeat.parts.heads import Prediction
+
+GATE = 1.0
+"""Logit of a gate at the start of training."""
 
 STACK = "stack"
 """Name of a weighted mean of baselines, which is made of registered ones."""
@@ -41,12 +49,12 @@ class CorrectedInputs:
     Attributes:
         inner: the same of the inner model.
         base: (batch, rows, channels) predictions of the base, scaled units.
-        scale: (batch, rows, channels) of the inner model's output, scaled units.
+        at: (batch, rows, channels) int64, position in the table of scales or of gates.
     """
 
     inner: Any
     base: Tensor
-    scale: Tensor
+    at: Tensor
 
     def __len__(self) -> int:
         return len(self.base)
@@ -58,18 +66,18 @@ class CorrectedInputs:
             index: (batch,) positions, int64.
         """
         inner, index = self.inner.take(index), index.to(self.base.device)
-        base, scale = (of[:, : inner.rows].index_select(0, index) for of in (self.base, self.scale))
-        return CorrectedInputs(inner, base, scale)
+        base, at = (of[:, : inner.rows].index_select(0, index) for of in (self.base, self.at))
+        return CorrectedInputs(inner, base, at)
 
 
 class CorrectedModel(BaseModel):
     """A model of parts that corrects a fitted causal baseline.
 
     Args:
-        inner: not anchored; its output is the correction.
+        inner: its output is the correction, or, where it is anchored, a prediction.
         base: fitted to data of the same channels, with the model's transforms applied.
         bins: of times since observation.
-        scale: (bins + 1, channels) unit of the output, in scaled units; its last row is for
+        scale: (bins + 1, channels) typical errors of the base, in scaled units; the last row is for
             predictions before the first observation of a channel.
     """
 
@@ -79,13 +87,15 @@ class CorrectedModel(BaseModel):
         super().__init__(f"{inner.name}_on_{name_of(base)}", inner.data)
         self.inner, self.base, self.bins = inner, base, bins
         self.register_buffer("scale", scale)
+        # Logits of the gates.
+        self.gate = nn.Parameter(torch.full_like(scale, GATE)) if inner.config.anchored else None
         # Saved with the weights; the base itself works on arrays.
         for name, array in self._arrays().items():
             self.register_buffer(_buffer(name), torch.from_numpy(np.array(array)))
 
     @classmethod
     def of(cls, inner: Model, base: CausalBaseline, tasks: Dataset) -> CorrectedModel:
-        """Makes an untrained model, which predicts what the base does.
+        """Makes an untrained model, which at first predicts what the base does, or close to it.
 
         Args:
             inner: untrained; the last layer of its decoder is set to 0.
@@ -93,9 +103,10 @@ class CorrectedModel(BaseModel):
             tasks: that give the scale; of a base that fits its own tasks closely, other ones.
 
         Raises:
-            InputError: the inner model has no decoder of its own, as an anchored one.
+            InputError: the inner model has no decoder whose last layer can be set to 0.
         """
-        _start_at_zero(inner)
+        if not inner.config.anchored:
+            _start_at_zero(inner)
         batch, bins = inner.batch(tasks), AgeBins.of(tasks)
         shape = (len(bins) + 1, inner.channels)
         found = cls(inner, base, bins, torch.ones(shape, dtype=inner.dtype))
@@ -185,16 +196,20 @@ class CorrectedModel(BaseModel):
     def prepare(self, batch: Batch) -> CorrectedInputs:
         """See `BaseModel`."""
         at = cells(batch, self.bins)
-        scale = self.scale[at, torch.arange(self.channels, device=at.device)]
-        return CorrectedInputs(self.inner.prepare(batch), self.predicted_by_base(batch), scale)
+        at = at * self.channels + torch.arange(self.channels, device=at.device)
+        return CorrectedInputs(self.inner.prepare(batch), self.predicted_by_base(batch), at)
 
     def run(
         self, prepared: CorrectedInputs, *, generator: torch.Generator | None = None
     ) -> Prediction:
         """See `BaseModel`."""
         output = self.inner.run(prepared.inner, generator=generator)
-        spread = None if output.scale is None else prepared.scale * output.scale
-        return Prediction(prepared.base + prepared.scale * output.mean, spread)
+        if self.gate is not None:
+            gate = torch.sigmoid(self.gate).flatten()[prepared.at]
+            return Prediction(prepared.base + gate * (output.mean - prepared.base), output.scale)
+        scale = self.scale.flatten()[prepared.at]
+        spread = None if output.scale is None else scale * output.scale
+        return Prediction(prepared.base + scale * output.mean, spread)
 
     def forward(self, batch: Batch, *, generator: torch.Generator | None = None) -> Prediction:
         """Predicts every row of a batch from earlier observations.
@@ -260,11 +275,12 @@ def _buffer(name: str) -> str:
 
 def _start_at_zero(inner: Model) -> None:
     """Sets the last layer of the decoder to 0."""
-    decoder = None if inner.config.anchored else getattr(inner.head, "decoder", None)
+    decoder = getattr(inner.head, "decoder", None)
     if decoder is None:
         raise InputError(
-            f"the model {inner.name!r} cannot correct a baseline: that takes a decoder whose last "
-            "layer starts at 0; give a model that is not anchored, such as gru or ode_gru_d"
+            f"the model {inner.name!r} with the head {inner.config.head!r} cannot correct a "
+            "baseline: that takes a decoder whose last layer starts at 0, such as that of the head "
+            "'point'"
         )
     with torch.no_grad():
         for tensor in decoder.layers[-1]:
