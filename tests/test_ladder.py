@@ -29,7 +29,8 @@ def test_the_best_candidate_on_validation_is_trained_in_full(tmp_path):
     assert 2 <= result.trial_epochs <= 8
     assert result.chosen == scores.index(min(scores))
     assert result.trials[result.chosen].candidate.learning_rate > 1e-9
-    assert result.fit.recipe.epochs == 3
+    assert result.fit.recipe.epochs == result.config.epochs == 3
+    assert result.config.learning_rate == result.trials[result.chosen].candidate.learning_rate
     assert result.score <= min(scores)
     loaded = ob.load_model(tmp_path)
     assert same(weights(loaded), weights(result.model))

@@ -20,6 +20,7 @@ from offbeat.examples import (
     TrainingSet,
     ValidationSet,
     fitted_baselines,
+    number_of_tasks,
     reference_tasks,
     relative_loss,
 )
@@ -125,6 +126,15 @@ def test_every_epoch_has_tasks_of_its_own_and_the_same_whenever_it_is_asked_for(
     assert torch.equal(again.epoch(1).prepared.table, second.prepared.table)
     assert not torch.equal(first.targets[:, :10], second.targets[:, :10])
     drawn.close(), again.close()
+
+
+def test_long_windows_of_many_channels_have_fewer_tasks_in_an_epoch():
+    times = 0.001 * np.arange(20_000)
+    one = ob.Dataset((ob.Trajectory(times, np.zeros((20_000, 40))),))
+    config = TaskConfig(horizon_s=2.0, gap_s=0.001)  # windows of 8,000 rows
+    assert number_of_tasks(one, config, 1024) == 64
+    assert number_of_tasks(one, replace(config, window_s=1.0), 1024) == 2**24 // (1000 * 40)
+    assert number_of_tasks(TRAIN, TASKS, 1024) == 1024
 
 
 @pytest.mark.parametrize("name", ["gru", "anchored_ode_gru_d"])
@@ -343,6 +353,28 @@ def test_a_requested_time_changes_no_other_prediction_of_a_corrected_baseline():
     many = ob.predict(model, data, times=[end + 0.2, end + 0.5])[0].values
     np.testing.assert_allclose(few[0], many[1], atol=1e-6)
     assert not np.allclose(many[0], many[1])
+
+
+@pytest.mark.parametrize("name", ["gru", "ode_gru_d", "anchored_ode_gru_d"])
+@pytest.mark.parametrize("base", ["damped_slope", "kalman_short"])
+def test_a_stream_predicts_what_the_batch_does(base, name):
+    model = corrected(base, name=name)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    task = draw_tasks(VALIDATION, TASKS, 4, seed=6, shares={"silence": 1.0})[0]
+    expected = ob.predict(model, ob.Dataset((task,)))[0].values
+    stream = ob.Stream(model)
+    for i, time in enumerate(task.times):
+        if i:
+            np.testing.assert_allclose(stream.predict(time), expected[i], atol=2e-6)
+        stream.observe(time, np.where(task.observed[i], task.values[i], np.nan))
+        if i == 20:
+            again = ob.Stream(model)
+            again.restore(stream.state())
+            after = time + 0.03
+            assert np.array_equal(again.predict(after), stream.predict(after))
 
 
 def test_a_backward_model_corrects_the_same_baseline_fitted_to_reversed_tasks():

@@ -15,7 +15,7 @@ from torch.nn.functional import huber_loss
 
 from offbeat.baselines import AgeBins, Baseline, fit_baseline
 from offbeat.baselines.errors import CLIPPED, ErrorTable, cells
-from offbeat.config import Recipe
+from offbeat.config import Recipe, TaskConfig
 from offbeat.data.batch import Batch
 from offbeat.data.tasks import draw_tasks
 from offbeat.data.trajectory import Dataset
@@ -28,6 +28,9 @@ REFERENCE_TASKS = 600
 
 VALIDATION_TASKS = 300
 """Tasks of validation, the same in every epoch."""
+
+MOST_VALUES = 2**24
+"""Values of the tasks of an epoch, at most: the number of tasks is lower where windows are long."""
 
 HUBER = 3.0
 """Errors beyond this multiple of the typical one count linearly in the relative loss."""
@@ -47,6 +50,21 @@ def ordered(model: BaseModel, dataset: Dataset) -> Dataset:
         dataset: to train, validate or fit on.
     """
     return model.transforms.apply(of_channels(dataset, model.names, model.units))
+
+
+def number_of_tasks(dataset: Dataset, config: TaskConfig, most: int) -> int:
+    """The number of tasks that are drawn at a time, so that memory is bounded.
+
+    Args:
+        dataset: that they are drawn from.
+        config: with the length of a window.
+        most: at most so many.
+
+    Returns:
+        `most`, or as many as have `MOST_VALUES` values, but not fewer than 64.
+    """
+    rows = max(int(np.searchsorted(t.times, t.times[0] + config.length_s)) for t in dataset)
+    return min(most, max(64, MOST_VALUES // (max(rows, 1) * dataset.channels)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +121,12 @@ def reference_tasks(train: Dataset, recipe: Recipe) -> tuple[Dataset, Dataset]:
     if recipe.tasks is None:
         return train, train
     fitted, measured = (
-        draw_tasks(train, recipe.tasks, REFERENCE_TASKS, seed=[recipe.seed, stream])
+        draw_tasks(
+            train,
+            recipe.tasks,
+            number_of_tasks(train, recipe.tasks, REFERENCE_TASKS),
+            seed=[recipe.seed, stream],
+        )
         for stream in (_FITTED, _MEASURED)
     )
     return fitted, measured
@@ -225,7 +248,10 @@ class TrainingSet:
         self._drawer = ThreadPoolExecutor(1) if recipe.tasks is not None else None
 
     def __len__(self) -> int:
-        return self._recipe.tasks_per_epoch if self._same is None else len(self._same)
+        if self._same is not None:
+            return len(self._same)
+        assert self._recipe.tasks is not None
+        return number_of_tasks(self._train, self._recipe.tasks, self._recipe.tasks_per_epoch)
 
     def epoch(self, epoch: int) -> Examples:
         """The examples of an epoch, the same whenever they are asked for.
@@ -253,9 +279,7 @@ class TrainingSet:
         recipe = self._recipe
         assert recipe.tasks is not None
         seed = [recipe.seed, _EPOCHS, epoch]
-        return self._examples(
-            draw_tasks(self._train, recipe.tasks, recipe.tasks_per_epoch, seed=seed)
-        )
+        return self._examples(draw_tasks(self._train, recipe.tasks, len(self), seed=seed))
 
     def _examples(self, tasks: Dataset) -> Examples:
         return Examples(self._model, self._model.batch(tasks), reference=self._reference)
@@ -322,8 +346,8 @@ class ValidationSet:
         """
         tasks = validation
         if recipe.tasks is not None:
-            seed = [recipe.seed, _VALIDATED]
-            tasks = draw_tasks(validation, recipe.tasks, VALIDATION_TASKS, seed=seed)
+            count = number_of_tasks(validation, recipe.tasks, VALIDATION_TASKS)
+            tasks = draw_tasks(validation, recipe.tasks, count, seed=[recipe.seed, _VALIDATED])
         batch = model.batch(tasks)
         found = cls(model, batch)
         if reference is not None:

@@ -13,7 +13,7 @@ from offbeat.config import ModelConfig, TrainConfig, check_seed, from_mapping
 from offbeat.data.scaler import Scaler, ScalerKind
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, FileFormatError, InputError
-from offbeat.examples import fitted_baselines, ordered, reference_tasks
+from offbeat.examples import fitted_baselines, number_of_tasks, ordered, reference_tasks
 from offbeat.files import writable, write_json
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import save_model
@@ -113,6 +113,7 @@ class LadderResult:
         trials: in the order of trial.
         trial_epochs: epochs of each trial.
         chosen: position of the best trial.
+        config: of the final training; a backward model can be trained with it too.
     """
 
     model: BaseModel
@@ -120,6 +121,7 @@ class LadderResult:
     trials: tuple[Trial, ...]
     trial_epochs: int
     chosen: int
+    config: TrainConfig
 
     @property
     def score(self) -> float:
@@ -196,12 +198,13 @@ def fit_ladder(
         )
     best = trials[chosen]
     model, epochs = ladder.made(best.candidate), config.epochs or best.epochs
+    config = replace(config, learning_rate=best.candidate.learning_rate, epochs=epochs)
     result = ladder.fitted(model, best.candidate, epochs, folder)
     if not result.validation_score <= best.score:  # the shorter training was the better one
         model.load_state_dict(trained[chosen].state_dict())
         if folder is not None:
             save_model(model, folder / "model")
-    return LadderResult(model, result, tuple(trials), trial_epochs, chosen)
+    return LadderResult(model, result, tuple(trials), trial_epochs, chosen, config)
 
 
 class _Ladder:
@@ -264,7 +267,9 @@ class _Ladder:
         if budget_s is None:
             trials = [Trial(candidate, 0.0, EPOCHS[1]) for candidate in candidates]
             return _write(folder, trials, TRIAL_EPOCHS[1])
-        steps = math.ceil(self.recipe.tasks_per_epoch / self.recipe.batch_size)
+        assert self.recipe.tasks is not None
+        tasks = number_of_tasks(self.train, self.recipe.tasks, self.recipe.tasks_per_epoch)
+        steps = math.ceil(tasks / self.recipe.batch_size)
         half = budget_s / 2 / (OVERHEAD * steps)
         trials, total = [], 0.0
         for candidate in candidates:

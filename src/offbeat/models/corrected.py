@@ -204,12 +204,28 @@ class CorrectedModel(BaseModel):
     ) -> Prediction:
         """See `BaseModel`."""
         output = self.inner.run(prepared.inner, generator=generator)
+        mean = self._joined(prepared.base, output.mean, prepared.at)
+        spread = output.scale
+        if spread is not None and self.gate is None:
+            spread = self.scale.flatten()[prepared.at] * spread
+        return Prediction(mean, spread)
+
+    def _joined(self, base: Tensor, output: Tensor, at: Tensor) -> Tensor:
         if self.gate is not None:
-            gate = torch.sigmoid(self.gate).flatten()[prepared.at]
-            return Prediction(prepared.base + gate * (output.mean - prepared.base), output.scale)
-        scale = self.scale.flatten()[prepared.at]
-        spread = None if output.scale is None else scale * output.scale
-        return Prediction(prepared.base + scale * output.mean, spread)
+            return base + torch.sigmoid(self.gate).flatten()[at] * (output - base)
+        return base + self.scale.flatten()[at] * output
+
+    def joined(self, base: Tensor, output: Tensor, age: Tensor) -> Tensor:
+        """The prediction from those of the base and the output of the inner model.
+
+        Args:
+            base: (..., channels) scaled units.
+            output: (..., channels) of the inner model.
+            age: (..., channels) s since the last observation of each channel; infinite before it.
+        """
+        at = torch.where(age.isinf(), len(self.bins), self.bins.of_age(age))
+        at = at * self.channels + torch.arange(self.channels, device=at.device)
+        return self._joined(base, output, at)
 
     def forward(self, batch: Batch, *, generator: torch.Generator | None = None) -> Prediction:
         """Predicts every row of a batch from earlier observations.

@@ -102,7 +102,7 @@ class BlendEngine(Engine):
 
     def export(self) -> Arrays:
         """The states of the baselines, and that of the model."""
-        own = {_STACK + name: value.copy() for name, value in _flat(self._state).items()}
+        own = {_STACK + name: value.copy() for name, value in flat_state(self._state).items()}
         if self._model is None:
             return own
         return {**own, **{_MODEL + name: value for name, value in self._model.export().items()}}
@@ -114,7 +114,7 @@ class BlendEngine(Engine):
                 {k.removeprefix(_MODEL): v for k, v in arrays.items() if k.startswith(_MODEL)}
             )
         own = {k.removeprefix(_STACK): v for k, v in arrays.items() if k.startswith(_STACK)}
-        self._state = _like(self._state, own, "")
+        self._state = like_state(self._state, own)
 
     def fingerprint(self) -> str:
         """Fingerprint of the model and of all tables."""
@@ -126,21 +126,21 @@ class BlendEngine(Engine):
         return digest.hexdigest()
 
 
-def _flat(state: Mapping[str, Any], prefix: str = "") -> Arrays:
+def flat_state(state: Mapping[str, Any], prefix: str = "") -> Arrays:
     """The arrays of nested states, by their names joined with slashes."""
     arrays: Arrays = {}
     for name, value in state.items():
         if isinstance(value, Mapping):
-            arrays |= _flat(value, f"{prefix}{name}/")
+            arrays |= flat_state(value, f"{prefix}{name}/")
         else:
             arrays[prefix + name] = np.asarray(value)
     return arrays
 
 
-def _like(state: Mapping[str, Any], arrays: Arrays, prefix: str) -> dict[str, Any]:
-    """The inverse of `_flat`, for states nested like these."""
+def like_state(state: Mapping[str, Any], arrays: Arrays, prefix: str = "") -> dict[str, Any]:
+    """The inverse of `flat_state`, for states nested like these."""
     return {
-        name: _like(value, arrays, f"{prefix}{name}/")
+        name: like_state(value, arrays, f"{prefix}{name}/")
         if isinstance(value, Mapping)
         else arrays[prefix + name]
         for name, value in state.items()

@@ -8,8 +8,10 @@ from offbeat.answers.blend import Blend
 from offbeat.config import check_seed
 from offbeat.data.scaler import Scaler
 from offbeat.models.base import BaseModel
+from offbeat.models.corrected import CorrectedModel
 from offbeat.models.model import Model
 from offbeat.stream.blend_engine import BlendEngine
+from offbeat.stream.corrected_engine import CorrectedEngine
 from offbeat.stream.cpu_engine import CpuEngine
 from offbeat.stream.engine import Engine
 from offbeat.stream.live import LiveStream, StreamInfo
@@ -61,7 +63,8 @@ class Stream(LiveStream):
             info, engine = of_blend(model, seed=check_seed(seed), window=chosen.window_rows)
             super().__init__(engine, info, options=chosen, time_unit=time_unit)
             return
-        limit = float(model.config.gap_limit or 1) if isinstance(model, Model) else 1.0
+        inner = model.inner if isinstance(model, CorrectedModel) else model
+        limit = float(inner.config.gap_limit or 1) if isinstance(inner, Model) else 1.0
         info = StreamInfo(
             names=model.names,
             units=model.units,
@@ -109,6 +112,8 @@ def engine_of(model: BaseModel, *, seed: int, window: int) -> Engine:
         seed: of the generator of self-feeding.
         window: rows that a model without a recurrent state is run on.
     """
+    if isinstance(model, CorrectedModel):
+        return CorrectedEngine(model, engine_of(model.inner, seed=seed, window=window))
     if not isinstance(model, Model):
         return ReplayEngine(model, window=window)
     if CpuEngine.unsupported(model) is None:
