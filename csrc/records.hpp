@@ -14,6 +14,7 @@ constexpr int MAX_GROUP = 128;
 // steps of 8 stages of 17 layers of 2^20 units for 64 lanes and 128 rows is less than 2^62.
 constexpr int64_t MAX_UNITS = 1 << 20;     // of a layer, of the channels, of the hidden state
 constexpr int64_t MAX_STEPS = 1'000'000;   // of the solver over one gap
+constexpr int MOST_NODES = 2048;           // after an observed row: kernels/spec.py
 constexpr int64_t MAX_COUNT = 2147483647;  // trajectories, rows
 
 enum Cell { CELL_NONE, CELL_START, CELL_ELMAN, CELL_LSTM, CELL_GRU };
@@ -34,7 +35,9 @@ struct Spec {
   Perceptron field, decoder;
   int stages = 1, steps = 1;
   double a[MAX_STAGES][MAX_STAGES] = {}, b[MAX_STAGES] = {};
-  double max_step = 0;  // 0: no bound
+  double max_step = 0;  // 0: no bound; with nodes, no vector field
+  int nodes = 0, bounded = 0;
+  double decay_span = 1;
   int decay_features = 0, decay_rows = CONTINUOUS, input_decay = 0;
 };
 
@@ -48,8 +51,9 @@ struct Quantity {
 
 template <class T>
 struct InputPointers {
-  Quantity<T> gap, update, updated, values, mask, time_input, decay_start, decay_end, delta, last;
-  const T* mean = nullptr;  // (channels,)
+  Quantity<T> gap, update, updated, values, mask, time_input, decay_start, decay_end, delta, last,
+      first_node, node, commit;
+  const T *mean = nullptr, *low = nullptr, *high = nullptr;  // (channels,)
   // (rows,) or null: 1 where the decoded state replaces the observed values.
   const uint8_t* use_prediction = nullptr;
 };
@@ -114,9 +118,10 @@ template <class T>
 struct StreamRow {
   const Spec* spec = nullptr;
   const T* packed = nullptr;
-  T gap = 0, update = 0, updated = 0;
+  T gap = 0, update = 0, updated = 0, first_node = 0, node = 0, commit = 0;
   const T *values = nullptr, *mask = nullptr, *time_input = nullptr, *decay_start = nullptr,
-          *decay_end = nullptr, *delta = nullptr, *last = nullptr, *mean = nullptr;
+          *decay_end = nullptr, *delta = nullptr, *last = nullptr, *mean = nullptr, *low = nullptr,
+          *high = nullptr;
   int use_prediction = 0;
   T *state = nullptr, *before = nullptr, *after = nullptr;  // (state,) each, not padded
   T* scratch = nullptr;

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -32,6 +32,9 @@ FLOWS: dict[str, dict[str, Any] | None] = {
     "heun": {"solver": "heun"},
     "rk4": {"solver": "rk4"},
     "rk4, several steps": {"solver": "rk4", "steps_per_gap": 2, "max_step": 0.4},
+    "euler, nodes": {"solver": "euler", "max_step": 0.3, "nodes": True, "decay_span": 4.0},
+    "heun, nodes": {"solver": "heun", "max_step": 0.4, "nodes": True, "decay_span": 3.0},
+    "none, nodes": {"nodes": True, "decay_span": 4.0, "cell_only": True},
 }
 
 
@@ -113,6 +116,7 @@ def problem(
     activation: str = "tanh",
     units: tuple[int, ...] = (7, 5),
     padded: bool = False,
+    bounded: bool = False,
     scale: float = 0.5,
     dtype: torch.dtype = torch.float32,
 ) -> Problem:
@@ -120,7 +124,12 @@ def problem(
     generator = torch.Generator().manual_seed(seed)
     driven = hidden + (channels if anchored else 0)
     features = {"none": 0, "delta": channels, "elapsed": 1}[decay]
-    if cell == "none" and flow == "none" and not features:
+    flow_options = dict(FLOWS[flow] or {})
+    no_field = FLOWS[flow] is None or flow_options.pop("cell_only", False)
+    nodes = bool(flow_options.get("nodes"))
+    if nodes:
+        decay_rows = "continuous"
+    if cell == "none" and no_field and not features:
         features = 1  # a scan of nothing at all has no weights
     has_cell = cell != "none"
     kind = KINDS[CELLS[cell]["cell"]] if has_cell else None
@@ -132,13 +141,14 @@ def problem(
         memory=kind.memory_per_unit * hidden if kind else 0,
         anchored=anchored,
         time_inputs=time_inputs if has_cell else 0,
-        field=() if FLOWS[flow] is None else (driven, *units, driven),
+        field=() if no_field else (driven, *units, driven),
+        bounded=bounded,
         activation=activation,  # type: ignore[arg-type]
         decay=features,
         decay_rows=decay_rows,  # type: ignore[arg-type]
         input_decay=input_decay,
         decoder=(hidden, 6, channels) if self_feeding else (),
-        **{**CELLS[cell], **(FLOWS[flow] or {})},
+        **{**CELLS[cell], **flow_options},
     )
 
     def normal(*shape: int, by: float = scale) -> Tensor:
@@ -195,8 +205,17 @@ def problem(
         last=normal(batch, rows, channels, by=1.0) if input_decay else None,
         mean=normal(channels) if input_decay else None,
         length=length,
+        low=-0.3 - uniform(channels) if bounded and anchored else None,
+        high=0.3 + uniform(channels) if bounded and anchored else None,
         fed=tuple(bool(b) for b in uniform(rows) < 0.5) if self_feeding else (),
     )
+    if nodes:
+        first, node = (2 * uniform(batch, rows)).floor(), (3 * uniform(batch, rows)).floor()
+        far = uniform(batch, rows) < 0.02
+        first = torch.where(far, first + 40, first) * bool(spec.field)
+        node = first + node * bool(spec.field)
+        commit = torch.maximum(update, (uniform(batch, rows) < 0.2).to(dtype))
+        given = replace(given, first_node=first, node=node, commit=commit)
     state = normal(batch, spec.state_size).requires_grad_()
     factors = tuple(normal(batch, rows, spec.state_size, by=1.0) for _ in range(2))
     return Problem(spec, parts, given, state, factors)  # type: ignore[arg-type]

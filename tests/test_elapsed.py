@@ -90,6 +90,7 @@ def by_hand(
         found["gap"].append(since_observed(time) - since_observed(before))
         found["delta"].append(channel_times(time))
         found["delta_before"].append(channel_times(before))
+        found["delta_observed"].append(channel_times(time if latest is None else latest))
         found["last"].append(list(last))
         found["observed"].append(bool(mask.any()))
         found["first"].append(bool(mask.any()) and not seen)

@@ -30,7 +30,7 @@ RK4: dict[str, Any] = {
 GRU, LSTM = 4, 3
 TANH, SILU = 0, 1
 QUANTITIES = ("gap", "update", "updated", "values", "mask", "time_input", "decay_start",
-              "decay_end", "delta", "last")  # fmt: skip
+              "decay_end", "delta", "last", "first_node", "node", "commit")  # fmt: skip
 
 
 def make_spec(**changes: Any) -> Any:
@@ -177,7 +177,7 @@ def test_a_tape_of_more_than_64_bits_has_the_largest_size(name: str) -> None:
 
 def from_table(table: NDArray[np.float32], index: list[int], rows: int, **changes: Any) -> Any:
     """Gap, update, two values and two mask entries as columns of a table."""
-    places = [(0, 1), (1, 1), (0, 0), (2, 2), (4, 2), *[(0, 0)] * 5]
+    places = [(0, 1), (1, 1), (0, 0), (2, 2), (4, 2), *[(0, 0)] * 8]
     options = {"places": places, "mean": None, "use_prediction": None, "length": None, **changes}
     return compiled.StepInputs_f32(
         table=table, index=np.array(index, np.int64), rows=rows, **options
@@ -199,7 +199,7 @@ COLUMNS = {
 @pytest.mark.parametrize("case", list(COLUMNS))
 def test_columns_outside_of_a_table_are_refused(case: str) -> None:
     which, place, message = COLUMNS[case]
-    places = [(0, 1), (1, 1), (0, 0), (2, 2), (4, 2), *[(0, 0)] * 5]
+    places = [(0, 1), (1, 1), (0, 0), (2, 2), (4, 2), *[(0, 0)] * 8]
     places[which] = place
     inputs = from_table(np.ones((2, 3, 6), np.float32), [0, 1], 3, places=places)
     with pytest.raises(ob.InputError, match=message):
@@ -218,7 +218,7 @@ TABLES: dict[str, tuple[dict[str, Any], str]] = {
     "columns with gaps": ({"table": np.ones((2, 3, 12), np.float32)[..., ::2]}, "contiguous col"),
     "two axes": ({"table": np.ones((2, 18), np.float32)}, r"table has shape \(2, 18\)"),
     "no trajectory": ({"table": np.ones((0, 3, 6), np.float32)}, "not in the table of 0"),
-    "a short list of places": ({"places": [(0, 1)]}, "number of places is 1, expected 10"),
+    "a short list of places": ({"places": [(0, 1)]}, "number of places is 1, expected 10 to 13"),
 }
 
 
@@ -261,10 +261,16 @@ def test_weights_of_the_wrong_size_are_refused(size: int) -> None:
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"steps_per_gap": 2**27}, "steps_per_gap is 134217728, expected 1 to 1000000"),
-        ({"steps_per_gap": 2**31 - 1}, "steps_per_gap is 2147483647"),
-        ({"steps_per_gap": 2**40}, "steps_per_gap is 1099511627776"),
-        ({"max_step": 1e-300}, "needs more than 1000000 steps of at most max_step"),
+        (
+            {"steps_per_gap": 2**27, "nodes": "rows"},
+            "steps_per_gap is 134217728, expected 1 to 1000000",
+        ),
+        ({"steps_per_gap": 2**31 - 1, "nodes": "rows"}, "steps_per_gap is 2147483647"),
+        ({"steps_per_gap": 2**40, "nodes": "rows"}, "steps_per_gap is 1099511627776"),
+        (
+            {"max_step": 1e-300, "nodes": "rows"},
+            "needs more than 1000000 steps of at most max_step",
+        ),
     ],
 )
 def test_models_and_streams_refuse_more_steps_than_there_can_be(
@@ -352,6 +358,37 @@ def test_a_gap_of_too_many_steps_is_refused(gap: float, max_step: float, name: s
     changes = {"gap": np.full((2, 3), gap, np.float32)}
     with pytest.raises(ob.InputError, match="needs more than 1000000 steps of at most max_step"):
         run({"max_step": max_step}, name, changes=changes)
+
+
+NODES = {
+    "NaN": (math.nan, 1.0),
+    "an infinite node": (0.0, math.inf),
+    "a negative first node": (-1.0, 1.0),
+    "a node before the first": (2.0, 1.0),
+    "a node beyond the last": (0.0, 2049.0),
+}
+
+
+@every_set
+@pytest.mark.parametrize("case", list(NODES))
+def test_nodes_that_are_not_there_are_refused(case: str, name: str) -> None:
+    first, node = (np.full((2, 3), value, np.float32) for value in NODES[case])
+    changes = {"first_node": first, "node": node, "commit": np.ones((2, 3), np.float32)}
+    with pytest.raises(ob.InputError, match="expected 0 <= first_node <= node <= 2048"):
+        run({"max_step": 0.1, "nodes": True}, name, changes=changes)
+
+
+@every_set
+def test_as_many_nodes_as_there_are_give_finite_numbers(name: str) -> None:
+    options = {"max_step": 0.1, "nodes": True, "bounded": True, "anchored": 2, "decay_features": 1}
+    node = np.full((2, 3), 2048, np.float32)
+    changes = {"first_node": 0 * node, "node": node, "commit": np.ones((2, 3), np.float32),
+               "low": np.full(2, -1, np.float32), "high": np.ones(2, np.float32)}  # fmt: skip
+    for keep in (True, False):
+        found = run(options, name, changes=changes, keep=keep)
+        assert all(bool(np.isfinite(each).all()) for each in found)
+    with pytest.raises(ob.InputError, match="low or high is missing"):
+        run(options, name, changes={**changes, "low": None})
 
 
 @every_set

@@ -34,14 +34,14 @@ def agree(case: Problem, *, keep: bool = True, strict: bool = True) -> None:
     """Every instruction set runs this very call, or raises; all equal the reference backend.
 
     Where it is not `strict`, shapes are random, and a tensor may be all cancellation: its largest
-    entry counts as at least a thousandth of all tensors' largest, and in single precision it is
+    entry counts as at least a hundredth of all tensors' largest, and in single precision it is
     enough to be as near to double precision as the reference backend is, times three.
     """
     expected = run(reference.scan, case)
     exact = expected
     if not strict and case.state.dtype == torch.float32:
         exact = run(reference.scan, case.double())
-    least = 0.0 if strict else 1e-3 * max(float(v.abs().max()) for v in expected.values())
+    least = 0.0 if strict else 1e-2 * max(float(v.abs().max()) for v in expected.values())
     allowed = {}
     for name, value in expected.items():
         assert bool(value.isfinite().all()), name
@@ -107,6 +107,7 @@ def problems(draw: Any, cell: str, flow: str) -> Problem:
         decay_rows=draw(st.sampled_from(["continuous", "every_row", "observed_rows"])),
         time_inputs=draw(st.sampled_from([0, 1, 3])),
         activation=draw(st.sampled_from(["tanh", "silu"])),
+        bounded=draw(st.booleans()),
         padded=draw(st.booleans()),
         dtype=draw(st.sampled_from([torch.float32, torch.float64])),
     )
@@ -132,6 +133,10 @@ LARGE = {
     "GRU with the reset after, RK4, decay within the gap": {
         "cell": "gru, reset after", "flow": "rk4, several steps", "decay": "delta", "batch": 65,
         "rows": 50, "units": (19,), "padded": True,
+    },
+    "anchored, bounded, nodes, decay": {
+        "cell": "gru", "flow": "heun, nodes", "anchored": True, "bounded": True, "decay": "delta",
+        "activation": "silu", "units": (19, 23), "batch": 67, "rows": 40, "padded": True,
     },
     "Elman, Heun, one trajectory": {
         "cell": "elman", "flow": "heun", "batch": 1, "rows": 399, "units": (29, 13),

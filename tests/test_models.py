@@ -278,7 +278,8 @@ def gru_d_in_floats(
 ) -> tuple[Tensor, Tensor]:
     """Equations 24 to 32, and the three meanings of a row at which the cell does not act.
 
-    - `continuous`: between updates h is gamma_h(delta) times the state of the last update.
+    - `continuous`: between updates h is gamma_h(delta) times the state of the last update. With
+      nodes at observations, that state is what is kept.
     - `every_row`: each row multiplies h by gamma_h of the cumulative delta; it compounds.
     - `observed_rows`: h decays only where the cell acts, and is left alone elsewhere.
     """
@@ -322,7 +323,7 @@ def gru_d_in_floats(
         h = arrived
         if acts:
             h = updated_h = gru_in_floats(model, arrived, [*x_hat, *map(float, mask)])
-        after.append(h)
+        after.append(updated_h if model.spec.nodes else h)
         last = [float(values[d]) if mask[d] else last[d] for d in range(channels)]
         mask_before, time_before = mask, time
     return torch.tensor(before, dtype=torch.float64), torch.tensor(after, dtype=torch.float64)
@@ -414,7 +415,8 @@ def test_ode_rnn_is_a_loop_over_torchdiffeq_step_by_step(
     pick: Callable[..., Dataset], solver: str, method: str, steps: int
 ) -> None:
     data = pick()
-    model = small_model("ode_rnn", solver=solver, steps_per_gap=steps, clock="first_row")
+    options: dict[str, Any] = {"solver": solver, "steps_per_gap": steps, "clock": "first_row"}
+    model = small_model("ode_rnn", nodes="rows", **options)
     expected = ode_rnn_by_torchdiffeq(model, data, method, steps=steps)
     got, before, _ = states_of(model, data)
     assert error(before, expected) < 1e-13
@@ -442,7 +444,7 @@ def test_ode_rnn_is_a_loop_over_torchdiffeq_within_the_tolerance_of_the_solver(
 
 def test_a_largest_step_takes_as_many_equal_steps_as_each_gap_needs() -> None:
     data = sample()
-    model = small_model("ode_rnn", max_step=0.11)
+    model = small_model("ode_rnn", max_step=0.11, nodes="rows")
     h, before, time_before = torch.zeros(4).double(), [], 0.0
     with torch.no_grad():
         for time, values, mask in rows_of(model, data):
@@ -455,11 +457,78 @@ def test_a_largest_step_takes_as_many_equal_steps_as_each_gap_needs() -> None:
     assert error(states_of(model, data)[1], torch.stack(before)) < 1e-13
 
 
+def by_nodes(model: Model, y: Tensor, time: float, method: str) -> Tensor:
+    """`time` after the last observed row: whole steps from node to node, then a shorter one."""
+    step = float(model.spec.max_step or 0)
+    whole = math.floor(time / step + 1e-6)
+    for _ in range(whole):
+        y = integrated(model, y, step, method)
+    return integrated(model, y, time - whole * step, method)
+
+
+@pytest.mark.parametrize(("solver", "method"), [("euler", "euler"), ("midpoint", "midpoint")])
+@pytest.mark.parametrize("options", [{}, {"max_step": 0.11}, {"steps_per_gap": 4}])
+@pytest.mark.parametrize("clock", ["first_row", "first_observation"])
+def test_nodes_lie_at_equal_times_after_the_last_observed_row(
+    clock: str, options: dict[str, Any], solver: str, method: str
+) -> None:
+    data = sample()
+    model = small_model("ode_rnn", solver=solver, clock=clock, **options)
+    expected = {"max_step": 0.11}.get(
+        next(iter(options), ""), 0.3 / options.get("steps_per_gap", 1)
+    )
+    assert model.spec.max_step == pytest.approx(expected)
+    h, latest, before = torch.zeros(4).double(), 0.0, []
+    with torch.no_grad():
+        for time, values, mask in rows_of(model, data):
+            arrived = by_nodes(model, h, time - latest, method)
+            before.append(arrived)
+            if mask.any():
+                h, latest = (
+                    gru_by_matrices(model, arrived, torch.cat([values, mask.double()])),
+                    time,
+                )
+    assert error(states_of(model, data)[1], torch.stack(before)) < 1e-12
+
+
+@pytest.mark.parametrize("decay", ["trainable", "vector", "scalar"])
+def test_between_nodes_h_decays_by_what_its_exponent_grows(decay: str) -> None:
+    """Lie splitting from node to node: before each step, and before the step that reads a row."""
+    data = sample()
+    model = small_model("ode_rnn", decay=decay)
+    step, h, latest = float(model.spec.max_step or 0), torch.zeros(4).double(), 0.0
+    delta, fresh, before = torch.zeros(3).double(), False, []
+
+    def exponent(since: float) -> Tensor:
+        if decay == "trainable":
+            weight, bias = model.decay.weight, model.decay.bias  # type: ignore[union-attr]
+            return torch.relu(weight @ (delta + since) + bias)
+        return nn.functional.softplus(model.decay.raw_tau).expand(4) * since  # type: ignore[union-attr, arg-type]
+
+    with torch.no_grad():
+        for time, values, mask in rows_of(model, data):
+            since = time - latest
+            whole = math.floor(since / step + 1e-6)
+            applied = torch.zeros(4).double() if fresh else exponent(0.0)
+            arrived = h
+            for k in range(whole + 1):
+                end = since if k == whole else step * (k + 1)
+                grown = (exponent(end) - applied).clamp_min(0)
+                arrived = integrated(model, torch.exp(-grown) * arrived, end - step * k, "euler")
+                applied = torch.maximum(applied, exponent(end))
+            before.append(arrived)
+            if mask.any():
+                h = gru_by_matrices(model, arrived, torch.cat([values, mask.double()]))
+                delta = torch.where(mask, 0.0, delta + since)
+                latest, fresh = time, True
+    assert error(states_of(model, data)[1], torch.stack(before)) < 1e-12
+
+
 @pytest.mark.parametrize("decay", ["trainable", "vector", "scalar"])
 def test_ode_gru_d_is_algorithm_3_where_every_row_is_observed(decay: str) -> None:
     """ODESolve(f, decayed h, gap) by one Euler step, then the GRU-D cell."""
     data = Dataset((with_observed(sample()[0], True),))
-    model = small_model("ode_gru_d", decay=decay)
+    model = small_model("ode_gru_d", decay=decay, nodes="rows")
     h, before, time_before = torch.zeros(4).double(), [], 0.0
     with torch.no_grad():
         for time, values, mask in rows_of(model, data):
@@ -533,7 +602,7 @@ def test_neural_ode_starts_at_a_linear_map_of_the_first_observed_row(method: str
     observed[0] = False
     observed[1] = [True, False, True]
     data = Dataset((with_observed(data[0], observed),))
-    model = small_model("neural_ode", solver=method, rtol=1e-9, atol=1e-10)
+    model = small_model("neural_ode", solver=method, rtol=1e-9, atol=1e-10, nodes="rows")
     rows = rows_of(model, data)
     _, values, mask = rows[1]
     with torch.no_grad():
@@ -555,7 +624,7 @@ def test_neural_ode_starts_at_a_linear_map_of_the_first_observed_row(method: str
 @pytest.mark.parametrize("decay", ["none", "trainable", "scalar"])
 def test_anchored_is_the_loop_of_innovations_with_x_set_where_observed(decay: str) -> None:
     data = sample()
-    model = small_model("anchored_ode_gru_d", decay=decay)
+    model = small_model("anchored_ode_gru_d", decay=decay, nodes="rows", bounded=False)
     mean = torch.tensor(model.statistics.mean, dtype=torch.float64)
     std = torch.tensor(model.statistics.std, dtype=torch.float64)
     model.mean.copy_(mean)
@@ -915,6 +984,10 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
         ({"typical_gap": 0}, "typical_gap must be a positive number"),
         ({"typical_gap": float("inf")}, "typical_gap must be a positive"),
         ({"max_step": float("inf")}, "max_step must be a positive"),
+        ({"max_step": 0.1, "steps_per_gap": 2}, "give max_step or steps_per_gap, not both"),
+        ({"nodes": "observations", "update_rows": "every"}, "nodes='observations' needs update_r"),
+        ({"nodes": "grid"}, "unknown model option nodes 'grid'"),
+        ({"bounded": 1}, "bounded must be true or false"),
         ({"gap_limit": 0.5}, "gap_limit must be at least 1"),
         ({"gap_limit": float("nan")}, "gap_limit must be at least 1"),
         ({"gap_limit": float("inf")}, "gap_limit must be"),
@@ -933,6 +1006,24 @@ def test_weights_of_the_anchored_model_start_at_1_over_fan_in() -> None:
 def test_an_option_that_cannot_be_is_refused_by_name(options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make_model("gru", dataset(3), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"max_step": 1e-6},
+            "max_step=1e-06 reaches 0.00205 with its 2048 nodes, less than",
+        ),
+        ({"steps_per_gap": 4096}, "max_step=7.32e-05 reaches 0.15 with its 2048 nodes"),
+    ],
+)
+def test_nodes_that_do_not_reach_the_next_row_are_refused(
+    options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        small_model("ode_rnn", **options)
+    small_model("ode_rnn", nodes="rows", **options)
 
 
 def test_an_unknown_model_is_refused_with_the_choices() -> None:

@@ -251,6 +251,8 @@ class Protocol:
                 solver=self.solver,
                 steps_per_gap=self.steps_per_gap,
                 typical_gap=self.anchored_typical_gap,
+                nodes="rows",
+                bounded=False,
             )
         options: dict[str, Any] = {
             "hidden_size": self.hidden_size,

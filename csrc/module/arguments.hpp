@@ -128,8 +128,8 @@ Perceptron perceptron_of(const std::vector<int64_t>& sizes, int64_t activation) 
 Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_inputs, int64_t cell,
              bool reset_after, const std::vector<int64_t>& field, int64_t activation,
              const std::vector<std::vector<double>>& a, const std::vector<double>& b, int64_t steps,
-             double max_step, int64_t decay_features, int64_t decay_rows, bool input_decay,
-             const std::vector<int64_t>& decoder) {
+             double max_step, bool nodes, double decay_span, bool bounded, int64_t decay_features,
+             int64_t decay_rows, bool input_decay, const std::vector<int64_t>& decoder) {
   Spec s;
   s.channels = int(in_range("channels", channels, 1, MAX_UNITS));
   s.hidden = int(in_range("hidden_size", hidden, 1, MAX_UNITS));
@@ -154,9 +154,15 @@ Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_in
   if (!(max_step >= 0) || std::isinf(max_step))
     refuse("max_step is " + text_of(max_step) + ", expected a finite number above 0");
   s.max_step = max_step;
+  s.nodes = nodes;
+  s.bounded = bounded;
+  if (!(decay_span > 0) || std::isinf(decay_span))
+    refuse("decay_span is " + text_of(decay_span) + ", expected a finite number above 0");
+  s.decay_span = decay_span;
   s.decay_features = int(in_range("decay", decay_features, 0, MAX_UNITS));
   s.decay_rows = int(in_range("decay_rows", decay_rows, CONTINUOUS, OBSERVED_ROWS));
   s.input_decay = input_decay;
+  if (nodes && decay_rows != CONTINUOUS) refuse("a scan with nodes has a continuous decay");
   s.field = perceptron_of(field, activation);
   s.decoder = perceptron_of(decoder, TANH);
   const int64_t driven = anchored + hidden;
@@ -167,6 +173,15 @@ Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_in
   if (s.decoder.layers) check_decoder(s.decoder, s);
   if (s.decoder.layers && anchored) refuse("an anchored state has no decoder");
   return s;
+}
+
+// The number of steps from the node that the state has reached to the last one before a row.
+template <class T>
+int steps_to_node(T first, T node) {
+  if (!(first >= 0 && first <= node && node <= T(MOST_NODES)))
+    refuse("first_node is " + text_of(first) + " and node " + text_of(node) +
+           ", expected 0 <= first_node <= node <= " + std::to_string(MOST_NODES));
+  return int(node) - int(first);
 }
 
 // The number of solver steps over a gap.

@@ -56,7 +56,20 @@ struct Call {
 // Steps of the solver over the longest gap; gaps after the last row of a trajectory do not count.
 template <class T>
 int most_steps(const Spec& s, const Call<T>& call) {
-  const Quantity<T>& gap = call.job.inputs.gap;
+  const InputPointers<T>& in = call.job.inputs;
+  if (s.nodes) {
+    int most = 1;
+    for (size_t i = 0; i < call.source.size(); ++i)
+      for (int64_t row = 0; row < call.length[i]; ++row) {
+        auto at = [&](const Quantity<T>& q) {
+          return q.data[call.source[i] * q.by_lane + row * q.by_row];
+        };
+        const bool read = at(in.gap) > 0 || s.decay_features;
+        most = std::max(most, steps_to_node(at(in.first_node), at(in.node)) + read);
+      }
+    return most;
+  }
+  const Quantity<T>& gap = in.gap;
   T longest = 0;
   if (s.max_step > 0 && s.field.layers)
     for (size_t i = 0; i < call.source.size(); ++i)

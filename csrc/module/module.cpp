@@ -55,13 +55,16 @@ void bind(nb::module_& m, const char* suffix) {
           [](StepInputs<T>* self, Maybe<T> gap, Maybe<T> update, Maybe<T> updated, Maybe<T> values,
              Maybe<T> mask, Maybe<T> time_input, Maybe<T> decay_start, Maybe<T> decay_end,
              Maybe<T> delta, Maybe<T> last, Maybe<T> mean,
-             std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length) {
+             std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length,
+             Maybe<T> first_node, Maybe<T> node, Maybe<T> commit, Maybe<T> low, Maybe<T> high) {
             if (!gap || gap->ndim() != 2)
               refuse("gap has shape " + (gap ? shape_of(*gap) : "None") +
                      ", expected (batch, rows)");
             const int64_t rows = int64_t(gap->shape(1));
             new (self) StepInputs<T>{{gap, update, updated, values, mask, time_input, decay_start,
-                                      decay_end, delta, last},
+                                      decay_end, delta, last, first_node, node, commit},
+                                     low,
+                                     high,
                                      mean,
                                      use_prediction,
                                      length,
@@ -76,21 +79,28 @@ void bind(nb::module_& m, const char* suffix) {
           nb::arg("decay_start").noconvert().none(), nb::arg("decay_end").noconvert().none(),
           nb::arg("delta").noconvert().none(), nb::arg("last").noconvert().none(),
           nb::arg("mean").noconvert().none(), nb::arg("use_prediction").noconvert().none(),
-          nb::arg("length").noconvert().none())
+          nb::arg("length").noconvert().none(), nb::arg("first_node").noconvert() = nb::none(),
+          nb::arg("node").noconvert() = nb::none(), nb::arg("commit").noconvert() = nb::none(),
+          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none())
       .def(
           "__init__",
           [](StepInputs<T>* self, Const<T> table, Const<int64_t> index,
-             const std::vector<std::pair<int64_t, int64_t>>& places, int64_t rows, Maybe<T> mean,
-             std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length) {
+             std::vector<std::pair<int64_t, int64_t>> places, int64_t rows, Maybe<T> mean,
+             std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length,
+             Maybe<T> low, Maybe<T> high) {
             if (table.ndim() != 3)
               refuse("table has shape " + shape_of(table) +
                      ", expected (trajectories, rows, columns)");
-            in_range("the number of places", int64_t(places.size()), QUANTITIES, QUANTITIES);
-            new (self) StepInputs<T>{{}, mean, use_prediction, length, table, index, places, rows};
+            // The last quantities belong to nodes, and may be left out.
+            in_range("the number of places", int64_t(places.size()), FIRST_NODE, QUANTITIES);
+            places.resize(QUANTITIES);
+            new (self) StepInputs<T>{
+                {}, low, high, mean, use_prediction, length, table, index, places, rows};
           },
           nb::arg("table").noconvert(), nb::arg("index").noconvert(), nb::arg("places"),
           nb::arg("rows"), nb::arg("mean").noconvert().none(),
-          nb::arg("use_prediction").noconvert().none(), nb::arg("length").noconvert().none());
+          nb::arg("use_prediction").noconvert().none(), nb::arg("length").noconvert().none(),
+          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none());
   m.def(
       "tape_size",
       [](const Spec& s, const std::string& set, const StepInputs<T>& inputs, Const<T> state) {
@@ -175,16 +185,16 @@ NB_MODULE(_cpu, m) {
           [](Spec* self, int64_t channels, int64_t hidden, int64_t anchored, int64_t time_inputs,
              int64_t cell, bool reset_after, const std::vector<int64_t>& field, int64_t activation,
              const std::vector<std::vector<double>>& a, const std::vector<double>& b, int64_t steps,
-             double max_step, int64_t decay_features, int64_t decay_rows, bool input_decay,
-             const std::vector<int64_t>& decoder) {
+             double max_step, bool nodes, double decay_span, bool bounded, int64_t decay_features,
+             int64_t decay_rows, bool input_decay, const std::vector<int64_t>& decoder) {
             new (self) Spec(spec_of(channels, hidden, anchored, time_inputs, cell, reset_after,
-                                    field, activation, a, b, steps, max_step, decay_features,
-                                    decay_rows, input_decay, decoder));
+                                    field, activation, a, b, steps, max_step, nodes, decay_span,
+                                    bounded, decay_features, decay_rows, input_decay, decoder));
           },
           nb::arg("channels"), nb::arg("hidden"), nb::arg("anchored"), nb::arg("time_inputs"),
           nb::arg("cell"), nb::arg("reset_after"), nb::arg("field"), nb::arg("activation"),
-          nb::arg("a"), nb::arg("b"), nb::arg("steps"), nb::arg("max_step"),
-          nb::arg("decay_features"), nb::arg("decay_rows"), nb::arg("input_decay"),
+          nb::arg("a"), nb::arg("b"), nb::arg("steps"), nb::arg("max_step"), nb::arg("nodes") = false,
+          nb::arg("decay_span") = 1.0, nb::arg("bounded") = false, nb::arg("decay_features"), nb::arg("decay_rows"), nb::arg("input_decay"),
           nb::arg("decoder"))
       .def_prop_ro("flat_size", [](const Spec& s) { return flat_size(s); })
       .def_prop_ro("state_size", [](const Spec& s) { return state_of(s); });

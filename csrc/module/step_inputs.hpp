@@ -11,17 +11,21 @@ enum {
   DECAY_END,
   DELTA,
   LAST,
+  FIRST_NODE,
+  NODE,
+  COMMIT,
   QUANTITIES
 };
 const char* const NAMES[QUANTITIES] = {"gap",        "update",      "updated",   "values", "mask",
-                                       "time_input", "decay_start", "decay_end", "delta",  "last"};
+                                       "time_input", "decay_start", "decay_end", "delta",  "last",
+                                       "first_node", "node",        "commit"};
 
 // Step inputs as Python passes them: one array per quantity, or a table of many trajectories with
 // the quantities as columns and the indices of the trajectories of this batch.
 template <class T>
 struct StepInputs {
   std::vector<Maybe<T>> arrays;
-  Maybe<T> mean;
+  Maybe<T> low, high, mean;
   std::optional<Const<uint8_t>> use_prediction;
   std::optional<Const<int64_t>> length;
   Maybe<T> table;  // (trajectories, rows, columns)
@@ -76,6 +80,17 @@ void take_rows(Job<T>& job, const Spec& s, const StepInputs<T>& f, int64_t batch
     if (!f.mean) refuse("mean is missing; this scan needs it");
     check_shape("mean", *f.mean, {s.channels});
     r.mean = f.mean->data();
+  }
+  if (s.nodes) {
+    r.first_node = f.get(FIRST_NODE, batch, -1);
+    r.node = f.get(NODE, batch, -1);
+    r.commit = f.get(COMMIT, batch, -1);
+  }
+  if (s.bounded && s.anchored) {
+    if (!f.low || !f.high) refuse("low or high is missing; a bounded scan needs them");
+    check_shape("low", *f.low, {s.channels});
+    check_shape("high", *f.high, {s.channels});
+    r.low = f.low->data(), r.high = f.high->data();
   }
   if (s.decoder.layers && f.use_prediction) {
     check_shape("use_prediction", *f.use_prediction, {f.rows});

@@ -3,6 +3,8 @@
 // a batch, are computed here for one row by the same operations in the same order, so that the bits
 // are equal.
 
+constexpr double LARGEST_VALUE = 1e15;  // models/model.py
+
 enum TimeInput { TIME_INPUT_NONE, TIME_INPUT_ELAPSED, TIME_INPUT_GAP, TIME_INPUT_DELTA };
 
 struct TimeSettings {  // how a model reads time; units and limits in s
@@ -12,13 +14,21 @@ struct TimeSettings {  // how a model reads time; units and limits in s
   bool exponential = false;  // the decay depends on the elapsed time, not on delta
 };
 
+// kernels/spec.py: nodes_before. The number of the last node before a time, and the time since then.
+double node_before(double time, double& rest) {
+  time = std::min(time, double(MOST_NODES));
+  const double node = std::floor(time + 1e-6);
+  rest = time - node < 1e-6 ? 0 : time - node;
+  return node;
+}
+
 template <class T>
 class StreamEngine {
  public:
   StreamEngine(const Spec& spec, const std::string& set, const Const<T>& weights,
                const Const<T>& mean, const Const<T>& std, const std::vector<int64_t>& decoder,
-               const Maybe<T>& decoder_weights, const Const<T>& first_state,
-               const TimeSettings& settings)
+               const Maybe<T>& decoder_weights, const Const<T>& first_state, const Maybe<T>& low,
+               const Maybe<T>& high, const TimeSettings& settings)
       : spec_(spec),
         kernels_(typed<T>(find_instruction_set(set))),
         time_(settings),
@@ -47,13 +57,20 @@ class StreamEngine {
       kernels_.stream_perceptron_pack(decoder_, decoder_weights->data(), decoder_packed_.get());
     }
     kernels_.stream_pack(spec_, weights.data(), packed_.get());
+    if (spec.bounded) {
+      if (!low || !high) refuse("low or high is None, but this model is bounded");
+      check_shape("low", *low, {C});
+      check_shape("high", *high, {C});
+      low_.assign(low->data(), low->data() + C);
+      high_.assign(high->data(), high->data() + C);
+    }
     mean_.assign(mean.data(), mean.data() + C);
     std_.assign(std.data(), std.data() + C);
     first_.state.assign(first_state.data(), first_state.data() + S);
     first_.last = mean_;
     first_.channel_at.assign(C, -INFINITY);
     now_ = first_;
-    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &out_}) v->assign(C, T(0));
+    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &last_, &out_}) v->assign(C, T(0));
     time_input_.assign(std::max(spec.time_inputs, 1), T(0));
     before_.assign(S, T(0));
     after_.assign(S, T(0));
@@ -71,7 +88,7 @@ class StreamEngine {
     if (observed_) now_.observed_at = time;
     for (int c = 0; c < spec_.channels; ++c)
       if (mask.data()[c]) now_.channel_at[c] = time, now_.last[c] = values.data()[c];
-    now_.updated = update_;
+    if (observed_ || !spec_.nodes) now_.updated = update_;
     ++now_.rows;
   }
 
@@ -139,6 +156,12 @@ class StreamEngine {
       observed_ |= on;
       mask_[c] = on;
       values_[c] = !on ? T(0) : spec_.anchored ? (values[c] - mean_[c]) / std_[c] : values[c];
+      last_[c] = now_.last[c];
+      if (!spec_.bounded) continue;
+      const T low = spec_.anchored ? T(-LARGEST_VALUE) : low_[c];
+      const T high = spec_.anchored ? T(LARGEST_VALUE) : high_[c];
+      if (on) values_[c] = std::min(std::max(values_[c], low), high);
+      if (!spec_.anchored) last_[c] = std::min(std::max(last_[c], low), high);
     }
     const double before = std::isnan(now_.time) ? time : now_.time;
     const bool starts = time_.from_first_row || observed_;
@@ -157,13 +180,21 @@ class StreamEngine {
         const double delta = std::max(time - lost - channel_clock, 0.0);
         const double delta_before = std::max((before - lost_before) - channel_clock, 0.0);
         delta_[c] = T(delta / time_.unit);
-        if (!time_.exponential) start_[c] = T(delta_before / time_.unit), end_[c] = delta_[c];
+        if (!time_.exponential && !spec_.nodes)
+          start_[c] = T(delta_before / time_.unit), end_[c] = delta_[c];
+        if (!time_.exponential && spec_.nodes) {
+          const double since = std::max(std::min(clock, time) - channel_clock, 0.0);
+          start_[c] = T(since / time_.unit);
+          end_[c] = T((since + time_.elapsed_limit) / time_.unit);
+        }
         if (time_.time_input == TIME_INPUT_DELTA)
           time_input_[c] = T(std::min(delta, time_.longest_delta) / time_.time_input_unit);
       }
     }
-    if (time_.exponential)
+    if (time_.exponential && !spec_.nodes)
       start_[0] = T(elapsed_before / time_.unit), end_[0] = T(elapsed / time_.unit);
+    if (time_.exponential && spec_.nodes)
+      start_[0] = T(0), end_[0] = T(time_.elapsed_limit / time_.unit);
     if (time_.time_input == TIME_INPUT_ELAPSED) time_input_[0] = T(elapsed / time_.time_input_unit);
     if (time_.time_input == TIME_INPUT_GAP)
       time_input_[0] = T((time - before) / time_.time_input_unit);
@@ -172,15 +203,28 @@ class StreamEngine {
     row.spec = &spec_;
     row.packed = packed_.get();
     row.gap = T((elapsed - elapsed_before) / time_.unit);
+    if (spec_.nodes) {
+      row.gap = T(elapsed / time_.unit);
+      row.commit = observed_;
+      if (spec_.max_step > 0) {
+        double rest = 0;
+        const double step = time_.unit * spec_.max_step;
+        row.first_node = T(node_before(elapsed_before / step, rest));
+        row.node = T(node_before(elapsed / step, rest));
+        row.gap = T(rest * spec_.max_step);
+        steps_to_node(row.first_node, row.node);
+      }
+    }
     row.update = update_;
     row.updated = now_.updated;
     row.values = values_.data(), row.mask = mask_.data(), row.time_input = time_input_.data();
     row.decay_start = start_.data(), row.decay_end = end_.data();
-    row.delta = delta_.data(), row.last = now_.last.data(), row.mean = mean_.data();
+    row.delta = delta_.data(), row.last = last_.data(), row.mean = mean_.data();
+    row.low = low_.data(), row.high = high_.data();
     row.use_prediction = use_prediction;
     row.state = now_.state.data(), row.before = before_.data(), row.after = after_.data();
     row.scratch = scratch_.get();
-    steps_of_gap(spec_, row.gap);  // refuses a gap of too many
+    if (!spec_.nodes) steps_of_gap(spec_, row.gap);  // refuses a gap of too many
     kernels_.stream_row(row);
   }
 
@@ -202,8 +246,8 @@ class StreamEngine {
   TimeSettings time_;
   Perceptron decoder_;
   Buffer<T> packed_, scratch_, decoder_packed_, decoder_scratch_;
-  std::vector<T> mean_, std_, values_, mask_, delta_, start_, end_, time_input_, before_, after_,
-      out_;
+  std::vector<T> mean_, std_, low_, high_, values_, mask_, delta_, start_, end_, last_, time_input_,
+      before_, after_, out_;
   State first_, now_;
   std::vector<State> slots_;
   bool observed_ = false, update_ = false;
@@ -217,7 +261,7 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
           "__init__",
           [](StreamEngine<T>* self, const Spec& spec, const std::string& set, Const<T> weights,
              Const<T> mean, Const<T> std, const std::vector<int64_t>& decoder,
-             Maybe<T> decoder_weights, Const<T> first_state, double unit, double time_input_unit,
+             Maybe<T> decoder_weights, Const<T> first_state, Maybe<T> low, Maybe<T> high, double unit, double time_input_unit,
              double elapsed_limit, double longest_delta, int64_t time_input, bool from_first_row,
              bool last_row, bool every_row, bool starts_only, bool exponential) {
             TimeSettings c;
@@ -227,12 +271,12 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
             c.last_row = last_row, c.every_row = every_row, c.starts_only = starts_only;
             c.exponential = exponential;
             new (self) StreamEngine<T>(spec, set, weights, mean, std, decoder, decoder_weights,
-                                       first_state, c);
+                                       first_state, low, high, c);
           },
           nb::arg("spec"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
           nb::arg("mean").noconvert(), nb::arg("std").noconvert(), nb::arg("decoder"),
           nb::arg("decoder_weights").noconvert().none(), nb::arg("first_state").noconvert(),
-          nb::arg("unit"), nb::arg("time_input_unit"), nb::arg("elapsed_limit"),
+          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none(), nb::arg("unit"), nb::arg("time_input_unit"), nb::arg("elapsed_limit"),
           nb::arg("longest_delta"), nb::arg("time_input"), nb::arg("from_first_row"),
           nb::arg("last_row"), nb::arg("every_row"), nb::arg("starts_only"), nb::arg("exponential"))
       .def("reset", &StreamEngine<T>::reset)

@@ -34,7 +34,7 @@ struct Back {
   GradientLayout places;
   Pairs& pairs;
   T *sums, *xt;
-  T *z, *to_values, *stage_gradients;  // scratch
+  T *z, *to_values, *stage_gradients, *to_node;  // scratch
 
   void push(int id, const T* to_out, const T* x) {
     if (pairs.count[id] == MAX_PAIRS) flush(c.map, pairs, P::W, c.lanes, sums, xt);
@@ -87,15 +87,25 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
   T* gate = to(k.places.gate);
   const bool values_need_gradient = f.active && (f.use_prediction || s.input_decay);
 
+  if (s.nodes)  // a state that was not kept leaves that of the node to the next row
+    P::each(d.S, [&](int64_t i, int lane) {
+      const V all = load<T>(g + i), kept = load<T>(f.commit + lane);
+      store<T>(g + i, kept != T(0) ? all : splat(0));
+      store<T>(k.to_node + i, kept != T(0) ? splat(0) : all);
+    });
   if (f.active) {
     cell_backward<P>(k, f, tape, slot, gh, g + l.c_at * W);
     k.push(M_IN, gate, at(l.u));
     if (d.A) {
       k.push(M_INNOV, gate, at(l.innovation));
       P::template transposed<false>(c.map.m[M_INNOV], c.packed, c.lanes, gate, k.z);
-      P::each(d.A, [&](int64_t i, int) {
+      const T* x = at(l.before);
+      P::each_unit(d.A, [&](int64_t i, int, int n) {
         const V m = load<T>(f.mask + i);
-        store<T>(g + i, (1 - m) * load<T>(g + i) - m * load<T>(k.z + i));
+        V to_x = m * load<T>(k.z + i);
+        if (s.bounded)
+          to_x = to_x * inside(load<T>(x + i), P::constant(c.low, n), P::constant(c.high, n));
+        store<T>(g + i, (1 - m) * load<T>(g + i) - to_x);
       });
     }
     if (values_need_gradient)
@@ -104,8 +114,11 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
   collect<P>(job, b, job.to_before, row, d.S, true, g);
 
   // Dynamics and decay, last step first.
-  T steps[W], span[W];
-  const int most = s.field.layers ? steps_of<P>(s, f.gap, steps) : 1;
+  Steps<P> p = steps_to_row<P>(s, f);
+  auto reach_node = [&] {
+    P::each(d.S,
+            [&](int64_t i, int) { store<T>(g + i, load<T>(g + i) + load<T>(k.to_node + i)); });
+  };
   const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
   T* to_start = to(k.places.start);
   T* to_end = to(k.places.end);
@@ -115,12 +128,14 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
     zero(to_end, int64_t(d.H) * W);
     zero(to_before, int64_t(d.H) * W);
   }
-  for (int q = most - 1; q >= 0; --q) {
+  if (s.nodes && !p.read) reach_node();
+  for (int q = p.whole + p.read - 1; q >= 0; --q) {
     const T* step = at(l.step) + int64_t(q) * l.step_size * W;
+    set_step<P>(s, f, q, p);
+    if (s.nodes && p.read && q == p.whole - 1) reach_node();
     if (s.field.layers) {
-      for (int i = 0; i < W; ++i) span[i] = T(q) < steps[i] ? f.gap[i] / steps[i] : T(0);
       T* kept = to(k.places.field) + int64_t(q) * s.stages * k.places.field_size * W;
-      runge_kutta_backward<P>(k, span, g, step + l.stage * W, kept);
+      runge_kutta_backward<P>(k, p.span, g, step + l.stage * W, step + l.limited * W, kept);
     }
     if (!d.F) continue;
     const T* applied = step + l.applied * W;
@@ -130,27 +145,40 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
     P::each(d.H, [&](int64_t i, int lane) {
       const V first = load<T>(at(l.start) + i), last = load<T>(at(l.end) + i);
       const V updated = load<T>(f.updated + lane);
-      const Exponent e = exponent(s, q, one_shot, first, last, updated, steps + lane, previous + i);
+      const Exponent e = exponent<P>(s, q, one_shot, first, last, updated, p, lane,
+                                     load<T>(f.first + lane), previous + i);
       const V bounded = clip(e.reached), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
       store<T>(gh + i, gradient * gamma);
       V to_growth = -gamma * gradient * load<T>(arrived + i);
-      if (s.field.layers) to_growth = bounded - e.before >= T(0) ? to_growth : splat(0);
+      if (s.field.layers || s.nodes)
+        to_growth = bounded - e.before >= T(0) ? to_growth : splat(0);
       // The applied exponent is the larger of the two; a tie splits the gradient.
       const V to_applied = load<T>(to_before + i);
-      const V slope = bounded > e.before    ? splat(1)
-                      : bounded == e.before ? splat(T(0.5))
-                                            : splat(0);
+      V slope = bounded > e.before    ? splat(1)
+                : bounded == e.before ? splat(T(0.5))
+                                      : splat(0);
+      if (s.nodes) {
+        const V active = load<T>(p.active + lane);
+        slope = active != T(0) ? slope : splat(0);
+        to_growth = active != T(0) ? to_growth : splat(0);
+      }
       const V to_bounded = to_growth + to_applied * slope;
       const V to_previous = to_applied * (1 - slope) - to_growth;
       const V to_reached = to_bounded * inside(e.reached);
       V start = load<T>(to_start + i) + (1 - e.fraction) * to_reached;
-      store<T>(to_end + i, load<T>(to_end + i) + e.fraction * to_reached);
-      if (q == 0 && s.decay_rows == CONTINUOUS)
-        start = start + (updated != T(0) ? splat(0) : to_previous * inside(first));
+      V end = load<T>(to_end + i) + e.fraction * to_reached;
+      if (q == 0 && s.decay_rows == CONTINUOUS) {
+        const V began = s.nodes ? fma(e.began, last - first, first) : first;
+        const V to_began = e.fresh != T(0) ? splat(0) : to_previous * inside(began);
+        start = start + (1 - e.began) * to_began;
+        end = end + e.began * to_began;
+      }
+      store<T>(to_end + i, end);
       store<T>(to_start + i, start);
       store<T>(to_before + i, to_previous);
     });
   }
+  if (s.nodes && p.read && !p.whole) reach_node();
   if (d.F) {
     P::each(d.H, [&](int64_t i, int lane) {
       const V valid = load<T>(f.valid + lane);
@@ -194,7 +222,7 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
 
 template <class P>
 static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const T* stages,
-                                          T* kept) {
+                                          const T* limited, T* kept) {
   const Context<P>& c = k.c;
   const Spec& s = c.s;
   const Layout<P>& l = c.l;
@@ -202,11 +230,21 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
   const int driven = c.map.d.D;
   const int64_t size = int64_t(driven) * W;
   T* to_stage = k.stage_gradients;
+  const T* moved = g;  // the gradient of the step
+  if (s.bounded) {
+    T* own = to_stage + s.stages * size;
+    P::each(driven, [&](int64_t i, int) {
+      const V kind = load<T>(limited + i), all = load<T>(g + i);
+      store<T>(own + i, kind > T(0) ? all : splat(0));
+      store<T>(g + i, kind != T(0) ? all : splat(0));
+    });
+    moved = own;
+  }
   for (int j = s.stages - 1; j >= 0; --j) {
     T* own = kept + int64_t(j) * k.places.field_size * W;
     T* to_slope = own + int64_t(k.places.field_size - driven) * W;
     P::each(driven, [&](int64_t i, int lane) {
-      V sum = T(s.b[j]) * load<T>(g + i);
+      V sum = T(s.b[j]) * load<T>(moved + i);
       for (int q = j + 1; q < s.stages; ++q)
         if (s.a[q][j] != 0) sum = fma(splat(T(s.a[q][j])), load<T>(to_stage + q * size + i), sum);
       store<T>(to_slope + i, sum * load<T>(span + lane));
@@ -214,6 +252,13 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
     const T* stage = stages + int64_t(j) * l.stage_size * W;
     evaluate_backward<P>(k, s.field, M_FIELD, l.field_net, stage, stage + l.network * W, own,
                          to_stage + j * size);
+    if (s.bounded)
+      P::each_unit(driven, [&](int64_t i, int, int n) {
+        T* own_stage = to_stage + j * size + i;
+        store<T>(own_stage, load<T>(own_stage) * inside(load<T>(stage + i),
+                                                        P::constant(c.low, n),
+                                                        P::constant(c.high, n)));
+      });
   }
   P::each(driven, [&](int64_t i, int) {
     V sum = load<T>(g + i);
@@ -236,7 +281,8 @@ static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
   const int64_t per_row = tape_row(s, max_steps, 2) + row_inputs_size(d, P::W) +
                           int64_t(gradient_layout(s, d, max_steps).size) * P::W;
   return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W +
-         int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * s.stages) * P::W +
+         int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * (s.stages + 1) + d.S) * P::W +
+         range_size(s, d) +
          int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
 }
 
@@ -255,15 +301,17 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
   };
   const int64_t W = P::W;
   T* state = take(d.S * W);
-  const Context<P> c = context<P>(job, b, p, take(work_size<P>(s)));
+  T* work = take(work_size<P>(s));
+  const Context<P> c = context<P>(job, b, p, work, take(range_size(s, d)));
   const int64_t row_size = c.l.size * W, slot_size = int64_t(places.size) * W;
   const int64_t inputs_size = row_inputs_size(d, P::W);
   Pairs pairs;
   T* z = take((widest<P>(s) + d.H) * W);  // the gradient of the applied exponent follows it
   T* to_values = take((d.C > d.H ? d.C : d.H) * W);
-  T* stage_gradients = take(int64_t(d.D) * s.stages * W);
+  T* stage_gradients = take(int64_t(d.D) * (s.stages + 1) * W);
+  T* to_node = take(d.S * W);
   T* xt = take(int64_t(PAIRS_AT_ONCE) * W * widest_input(p));
-  Back<P> k{c, places, pairs, sums, xt, z, to_values, stage_gradients};
+  Back<P> k{c, places, pairs, sums, xt, z, to_values, stage_gradients, to_node};
   T* lanes = take(inputs_size * job.group);
   T* gradients = take(slot_size * job.group);
   T* own = job.tape ? nullptr : take(row_size * job.group);

@@ -29,20 +29,78 @@ static int steps_of(const Spec& s, const T* gap, T* steps) {
   return most;
 }
 
-// The exponent of a decay at a step of the solver: applied before the step, reached at its end, and
-// the fraction of the gap at its end.
-struct Exponent {
-  V before, reached, fraction;
+// The steps of one row. Without nodes, `whole` steps divide the gap. With nodes, `whole` steps lead
+// to the last node, and one more reads the row where `read` is set.
+template <class P>
+struct Steps {
+  static constexpr int N = P::ONE ? VW : P::W;
+  int whole = 1, read = 0;
+  T count[N];     // without nodes: steps of each lane
+  T span[N];      // length of the current step
+  T fraction[N];  // of the time between the inputs of the decay, at the end of the step
+  T active[N];    // with nodes: 0 where a lane has taken its steps
+  T first[N];     // with nodes: the fraction at the first node
 };
+template <class P>
+static Steps<P> steps_to_row(const Spec& s, const RowInputs<P>& f) {
+  Steps<P> p;
+  if (!s.nodes) {
+    if (s.field.layers) p.whole = steps_of<P>(s, f.gap, p.count);
+    return p;
+  }
+  p.whole = 0;
+  for (int i = 0; i < Steps<P>::N; ++i) {
+    const int whole = int(f.node[i]) - int(f.first[i]);
+    if (whole > p.whole) p.whole = whole;
+    const bool fresh = s.decay_features && f.node[i] == 0 && f.updated[i] != 0;
+    if (f.gap[i] > 0 || fresh) p.read = 1;
+    p.first[i] = f.first[i] * T(s.max_step) / T(s.decay_span);
+  }
+  return p;
+}
+template <class P>
+static void set_step(const Spec& s, const RowInputs<P>& f, int k, Steps<P>& p) {
+  for (int i = 0; i < Steps<P>::N; ++i) {
+    if (!s.nodes) {
+      if (s.field.layers) p.span[i] = T(k) < p.count[i] ? f.gap[i] / p.count[i] : T(0);
+      continue;
+    }
+    const bool read = k == p.whole;
+    const T node = read ? f.node[i] : f.first[i] + T(k + 1);
+    p.active[i] = read || node <= f.node[i];
+    p.span[i] = read ? f.gap[i] : p.active[i] * T(s.max_step);
+    p.fraction[i] = (node * T(s.max_step) + (read ? f.gap[i] : T(0))) / T(s.decay_span);
+  }
+}
+
+// The exponent of a decay at a step of the solver: applied before the step, reached at its end, and
+// the fraction of the time between the inputs of the decay at its end. At the first step `before`
+// is the exponent at the fraction `began`, or 0 where `fresh` is 1.
+struct Exponent {
+  V before, reached, fraction, began, fresh;
+};
+template <class P>
 static INLINE Exponent exponent(const Spec& s, int step, bool one_shot, V first, V last, V updated,
-                                const T* steps, const T* previous) {
-  Exponent e{splat(0), last, splat(1)};
+                                const Steps<P>& p, int lane, V node, const T* previous) {
+  Exponent e{splat(0), last, splat(1), splat(0), splat(1)};
+  const V on = updated != T(0) ? splat(1) : splat(0);
+  if (s.nodes) {
+    e.fresh = node == T(0) ? on : splat(0);
+    const V one = on * (T(s.max_step) / T(s.decay_span));
+    const V along = last >= first ? load<T>(p.first + lane) : one;
+    e.began = node > T(0) ? along : splat(0);
+  } else if (s.decay_rows == CONTINUOUS) {
+    e.fresh = on;
+  }
   if (step)
     e.before = load<T>(previous);
-  else if (s.decay_rows == CONTINUOUS)
-    e.before = updated != T(0) ? splat(0) : clip(first);
-  if (!one_shot) {
-    e.fraction = T(step + 1) / load<T>(steps);
+  else
+    e.before = e.fresh != T(0) ? splat(0) : clip(s.nodes ? fma(e.began, last - first, first) : first);
+  if (s.nodes) {
+    e.fraction = load<T>(p.fraction + lane);
+    e.reached = fma(e.fraction, last - first, first);
+  } else if (!one_shot) {
+    e.fraction = T(step + 1) / load<T>(p.count + lane);
     e.fraction = e.fraction > T(1) ? splat(1) : e.fraction;
     e.reached = fma(e.fraction, last - first, first);
   }
@@ -57,7 +115,6 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   constexpr int W = P::W;
   auto at = [&](int64_t units) { return tape + units * W; };
   T* h = state + l.h_at * W;
-  T* memory = state + l.c_at * W;
   T* z = c.work;  // as wide as the widest layer
 
   // The cell's input: observed values, decayed values, or the decoded state before the gap.
@@ -79,6 +136,11 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
         const V decayed = fma(gamma, load<T>(f.last + i), (1 - gamma) * mean);
         store<T>(u + i, mask != T(0) ? load<T>(f.values + i) : decayed);
       });
+    } else if (s.bounded && d.A) {
+      P::each_unit(d.C, [&](int64_t i, int, int k) {
+        store<T>(u + i, within(load<T>(f.values + i), P::constant(c.low, k),
+                               P::constant(c.high, k)));
+      });
     } else {
       copy<P>(d.C, f.values, u);
     }
@@ -90,7 +152,7 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   // Decay and dynamics over the gap.
   T* start = at(l.start);
   T* end = at(l.end);
-  const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
+  const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);  // without nodes
   if (d.F) {
     P::template affine<false>(c.map.m[M_DECAY], c.packed, c.lanes, f.start, start);
     P::template affine<false>(c.map.m[M_DECAY], c.packed, c.lanes, f.end, end);
@@ -103,9 +165,11 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
       store<T>(end + i, last);
     });
   }
-  T steps[P::ONE ? VW : W], span[P::ONE ? VW : W];
-  const int most = s.field.layers ? steps_of<P>(s, f.gap, steps) : 1;
-  for (int k = 0; k < most; ++k) {
+  Steps<P> p = steps_to_row<P>(s, f);
+  const int units = P::ONE ? int(l.state) : d.S;
+  for (int k = 0; k < p.whole + p.read; ++k) {
+    if (s.nodes && k == p.whole) copy<P>(units, state, at(l.node));
+    set_step<P>(s, f, k, p);
     T* step = at(l.step) + int64_t(k) * l.step_size * W;
     if (d.F) {
       T* applied = step + l.applied * W;
@@ -115,30 +179,56 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
       P::each(d.H, [&](int64_t i, int lane) {
         const V first = load<T>(start + i), last = load<T>(end + i);
         const V updated = load<T>(f.updated + lane);
-        const Exponent e =
-            exponent(s, k, one_shot, first, last, updated, steps + lane, previous + i);
+        const Exponent e = exponent<P>(s, k, one_shot, first, last, updated, p, lane,
+                                       load<T>(f.first + lane), previous + i);
         V growth = clip(e.reached) - e.before;
-        if (s.field.layers) growth = growth < T(0) ? splat(0) : growth;
+        if (s.field.layers || s.nodes) growth = growth < T(0) ? splat(0) : growth;
+        const V bounded = clip(e.reached);
+        V after = bounded > e.before ? bounded : e.before;
+        if (s.nodes) {
+          const V active = load<T>(p.active + lane);
+          growth = active != T(0) ? growth : splat(0);
+          after = active != T(0) ? after : e.before;
+        }
         const V gamma = exp_(-growth), before = load<T>(h + i);
         store<T>(arrived + i, before);
         store<T>(factor + i, gamma);
         store<T>(h + i, before * gamma);
-        const V bounded = clip(e.reached);
-        store<T>(applied + i, bounded > e.before ? bounded : e.before);
+        store<T>(applied + i, after);
       });
     }
-    if (!s.field.layers) break;
-    for (int i = 0; i < (P::ONE ? VW : W); ++i)
-      span[i] = T(k) < steps[i] ? f.gap[i] / steps[i] : T(0);
-    runge_kutta<P>(c, span, state, step + l.stage * W, z);
+    if (s.field.layers)
+      runge_kutta<P>(c, p.span, state, step + l.stage * W, step + l.limited * W, z);
   }
+  if (s.nodes && !p.read) copy<P>(units, state, at(l.node));
 
   copy<P>(P::ONE ? l.state : d.S, state, at(l.before));
-  if (!f.active) return;
+  if (f.active) update<P>(c, f, state, tape);
+  if (!s.nodes) return;
+  const T* node = at(l.node);
+  P::each(units, [&](int64_t i, int lane) {
+    const V kept = load<T>(f.commit + lane);
+    store<T>(state + i, kept != T(0) ? load<T>(state + i) : load<T>(node + i));
+  });
+}
+
+// The observation of a row: anchored channels take the observed values, and the cell acts.
+template <class P>
+static NOINLINE void update(const Context<P>& c, const RowInputs<P>& f, T* state, T* tape) {
+  const Spec& s = c.s;
+  const Dims& d = c.map.d;
+  const Layout<P>& l = c.l;
+  constexpr int W = P::W;
+  T* gate = tape + l.gate * W;
   if (d.A) {
-    T* e = at(l.innovation);
-    P::each(d.A, [&](int64_t i, int) {
-      store<T>(e + i, load<T>(f.mask + i) * (load<T>(f.values + i) - load<T>(state + i)));
+    T* e = tape + l.innovation * W;
+    P::each_unit(d.A, [&](int64_t i, int, int k) {
+      V value = load<T>(f.values + i), x = load<T>(state + i);
+      if (s.bounded) {
+        const V low = P::constant(c.low, k), high = P::constant(c.high, k);
+        value = within(value, low, high), x = within(x, low, high);
+      }
+      store<T>(e + i, load<T>(f.mask + i) * (value - x));
     });
     P::template affine<true>(c.map.m[M_INNOV], c.packed, c.lanes, e, gate);
     P::each(d.A, [&](int64_t i, int) {
@@ -146,7 +236,7 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
       store<T>(state + i, m * load<T>(f.values + i) + (1 - m) * load<T>(state + i));
     });
   }
-  cell_forward<P>(c, f, h, memory, gate, at(l.inner));
+  cell_forward<P>(c, f, state + l.h_at * W, state + l.c_at * W, gate, tape + l.inner * W);
 }
 
 template <class P>
@@ -155,9 +245,12 @@ static INLINE void copy(int units, const T* from, T* to) {
 }
 
 // One step of the solver, of length `span` in each lane. The tape keeps the stages and their
-// layers.
+// layers. In a bounded scan the field is evaluated within the range of the state, and the step does
+// not leave it; `limited` keeps what the state became: 1 the result of the step, 0 an end of the
+// range, -1 the old state, which was outside of it.
 template <class P>
-static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T* stages, T* z) {
+static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T* stages,
+                                 T* limited, T* z) {
   const Spec& s = c.s;
   const Layout<P>& l = c.l;
   constexpr int W = P::W;
@@ -176,14 +269,30 @@ static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T
         store<T>(stage + i, fma(load<T>(span + lane), sum, load<T>(state + i)));
       });
     }
+    if (s.bounded)
+      P::each_unit(driven, [&](int64_t i, int, int k) {
+        store<T>(stage + i,
+                 within(load<T>(stage + i), P::constant(c.low, k), P::constant(c.high, k)));
+      });
     evaluate<P>(c, s.field, M_FIELD, l.field_net, stage, stage + l.network * W, slopes + j * size,
                 z);
   }
-  P::each(driven, [&](int64_t i, int lane) {
+  P::each_unit(driven, [&](int64_t i, int lane, int k) {
     V sum = splat(0);
     for (int q = 0; q < s.stages; ++q)
       if (s.b[q] != 0) sum = fma(splat(T(s.b[q])), load<T>(slopes + q * size + i), sum);
-    store<T>(state + i, fma(load<T>(span + lane), sum, load<T>(state + i)));
+    const V old = load<T>(state + i);
+    V moved = fma(load<T>(span + lane), sum, old);
+    if (s.bounded) {
+      const V low = P::constant(c.low, k), high = P::constant(c.high, k);
+      const V least = old < low ? old : low, most = old > high ? old : high;
+      V kind = moved < least ? (old < low ? splat(-1) : splat(0)) : splat(1);
+      moved = moved < least ? least : moved;
+      kind = moved > most ? (old > high ? splat(-1) : splat(0)) : kind;
+      moved = moved > most ? most : moved;
+      store<T>(limited + i, kind);
+    }
+    store<T>(state + i, moved);
   });
 }
 
@@ -243,18 +352,21 @@ static int64_t forward_scratch(const Spec& s, int max_steps) {
   using P = Many<2>;
   const Dims d = dims(s);
   return int64_t(d.S) * P::W + row_inputs_size(d, P::W) + work_size<P>(s) +
-         tape_row(s, max_steps, 2) + 64;
+         tape_row(s, max_steps, 2) + range_size(s, d) + 64;
 }
 
 template <class P>
-static Context<P> context(const Job<T>& job, const Block& b, const Map& map, T* work) {
+static Context<P> context(const Job<T>& job, const Block& b, const Map& map, T* work, T* limits) {
+  range<P>(*job.spec, map.d, job.inputs.low, job.inputs.high, limits);
   return Context<P>{*job.spec,
                     map,
                     job.packed,
                     job.packed + map.packed_vectors,
                     layout<P>(*job.spec, map.d, job.max_steps),
                     work,
-                    b.lanes};
+                    b.lanes,
+                    limits,
+                    limits + P::pad(map.d.A) + P::pad(map.d.H)};
 }
 
 template <class P>
@@ -264,8 +376,9 @@ static void block_forward(const Job<T>& job, const Block& b, int begin, int end,
   T* state = scratch;
   T* lanes = state + int64_t(d.S) * P::W;
   T* work = lanes + row_inputs_size(d, P::W);
-  T* own = work + work_size<P>(*job.spec);
-  const Context<P> c = context<P>(job, b, p, work);
+  T* limits = work + work_size<P>(*job.spec);
+  T* own = limits + range_size(*job.spec, d);
+  const Context<P> c = context<P>(job, b, p, work, limits);
   RowInputs<P> f = row_inputs<P>(d, lanes);
   const int64_t row_size = c.l.size * P::W;
   if (begin)

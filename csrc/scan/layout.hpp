@@ -53,8 +53,8 @@ static Net net(const Perceptron& shape) {
 }
 template <class P>
 struct Layout {
-  int64_t u, start, end, before, gate, inner, innovation, decoded, h_before;
-  int64_t decoder, step, step_size, applied, factor, arrived, stage, stage_size, y, network, size;
+  int64_t u, start, end, before, node, gate, inner, innovation, decoded, h_before;
+  int64_t decoder, step, step_size, applied, factor, arrived, limited, stage, stage_size, y, network, size;
   Net field_net, decoder_net;
   int64_t x_at, h_at, c_at, state;  // inside a state
 };
@@ -75,6 +75,7 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
   l.start = take(d.F ? d.H : 0);
   l.end = take(d.F ? d.H : 0);
   l.before = at, at += l.state;
+  l.node = at, at += s.nodes ? l.state : 0;
   l.gate = at, at += d.cell ? d.G / d.H * P::pad(d.H) : 0;
   l.inner = take(d.H);
   l.innovation = take(d.A);
@@ -89,6 +90,7 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
     l.factor = step, step += P::pad(d.H);
     l.arrived = step, step += P::pad(d.H);
   }
+  l.limited = step, step += s.bounded ? P::pad(d.A) + P::pad(d.H) : 0;
   l.stage = step;
   l.y = 0;
   l.network = P::pad(d.A) + P::pad(d.H);
@@ -106,12 +108,12 @@ static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
 // The step inputs of one row for the lanes of a block. A lane past its last row keeps its state.
 template <class P>
 struct RowInputs {
-  T *gap, *update, *updated, *valid, *values, *mask, *time_input, *start, *end, *delta, *last;
+  T *gap, *update, *updated, *valid, *first, *node, *commit, *values, *mask, *time_input, *start, *end, *delta, *last;
   const T* mean;
   T* zeros;  // inputs of a lane past its last row
   bool active = false, use_prediction = false;
 };
-static constexpr int ROW_SCALARS = 4;
+static constexpr int ROW_SCALARS = 7;
 static int64_t row_inputs_size(const Dims& d, int lanes) {
   return ROW_SCALARS * (lanes < VW ? VW : lanes) + (4 * d.C + d.time_inputs + 2 * d.F) * lanes +
          widest_quantity(d);
@@ -124,7 +126,8 @@ static int widest_quantity(const Dims& d) {
 template <class P>
 static RowInputs<P> row_inputs(const Dims& d, T* at) {
   RowInputs<P> f{};
-  for (T** p : {&f.gap, &f.update, &f.updated, &f.valid}) *p = at, at += P::W;
+  for (T** p : {&f.gap, &f.update, &f.updated, &f.valid, &f.first, &f.node, &f.commit})
+    *p = at, at += P::W;
   f.values = at, at += d.C * P::W;
   f.mask = at, at += d.C * P::W;
   f.time_input = at, at += d.time_inputs * P::W;
@@ -157,6 +160,9 @@ static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, in
     f.gap[lane] = one(job.inputs.gap);
     f.update[lane] = one(job.inputs.update);
     f.updated[lane] = one(job.inputs.updated);
+    f.first[lane] = one(job.inputs.first_node);
+    f.node[lane] = one(job.inputs.node);
+    f.commit[lane] = one(job.inputs.commit);
     f.active |= d.cell && f.update[lane] != 0;
   }
   auto many = [&](const Quantity<T>& quantity, int n, T* out) {
@@ -203,4 +209,29 @@ struct Context {
   Layout<P> l;
   T* work;           // scratch: a layer, then the slopes of the stages
   int lanes = P::W;  // lanes in use; the others are padding
+  const T *low = nullptr, *high = nullptr;  // of the driven units of a bounded scan
 };
+
+// The range of the driven units, laid out as a state.
+template <class P>
+static void range(const Spec& s, const Dims& d, const T* low, const T* high, T* out) {
+  if (!s.bounded) return;
+  const int x = P::pad(d.A), n = x + P::pad(d.H);
+  for (int u = 0; u < n; ++u) {
+    const bool channel = u < d.A;
+    out[u] = channel ? low[u] : -HIDDEN_LIMIT;
+    out[n + u] = channel ? high[u] : HIDDEN_LIMIT;
+  }
+}
+static int range_size(const Spec& s, const Dims& d) {
+  return s.bounded ? 2 * (up(d.A, VW) + up(d.H, VW)) : 0;
+}
+// x inside of the range from `low` to `high`.
+static INLINE V within(V x, V low, V high) {
+  x = x < low ? low : x;
+  return x > high ? high : x;
+}
+// The derivative of `within`; 0 at its ends, too.
+static INLINE V inside(V x, V low, V high) {
+  return x > low ? (x < high ? splat(1) : splat(0)) : splat(0);
+}

@@ -86,7 +86,7 @@ static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratc
   T* sums = job.sums + slot * p.sums;
   zero(sums, p.sums);
   Pairs pairs;
-  Back<P> k{c, GradientLayout{}, pairs, sums, xt, z, nullptr, nullptr};
+  Back<P> k{c, GradientLayout{}, pairs, sums, xt, z, nullptr, nullptr, nullptr};
   const int64_t blocks = (job.n + P::W - 1) / P::W;
   const int64_t begin = blocks * slot / job.slots, end = blocks * (slot + 1) / job.slots;
   for (int64_t block = begin; block < end; ++block) {

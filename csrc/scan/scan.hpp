@@ -15,6 +15,7 @@ struct Scan {
   using V = typename Lanes<T>::V;
   static constexpr int VW = Lanes<T>::W;
   static constexpr T LARGEST_EXPONENT = 30;
+  static constexpr T HIDDEN_LIMIT = 10;  // of a hidden unit in a bounded scan
 
   static V splat(T s) { return broadcast<T>(s); }
 

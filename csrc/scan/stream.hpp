@@ -7,7 +7,7 @@ static int64_t stream_inputs_size(const Dims& d) {
 static int64_t stream_scratch(const Spec& s) {
   const Dims d = dims(s);
   const Layout<One> l = layout<One>(s, d, 1);
-  return stream_inputs_size(d) + l.state + l.size + work_size<One>(s) + 8 * VW;
+  return stream_inputs_size(d) + l.state + l.size + work_size<One>(s) + range_size(s, d) + 8 * VW;
 }
 
 static void stream_row(const StreamRow<T>& row) {
@@ -21,9 +21,12 @@ static void stream_row(const StreamRow<T>& row) {
     return here;
   };
   RowInputs<One> f{};
-  for (T** lane : {&f.gap, &f.update, &f.updated, &f.valid}) *lane = take(VW);
-  for (int i = 0; i < VW; ++i)
+  for (T** lane : {&f.gap, &f.update, &f.updated, &f.valid, &f.first, &f.node, &f.commit})
+    *lane = take(VW);
+  for (int i = 0; i < VW; ++i) {
     f.gap[i] = row.gap, f.update[i] = row.update, f.updated[i] = row.updated, f.valid[i] = 1;
+    f.first[i] = row.first_node, f.node[i] = row.node, f.commit[i] = row.commit;
+  }
   auto padded = [&](const T* from, int n) {
     T* to = take(up(n, VW));
     if (from)
@@ -47,8 +50,11 @@ static void stream_row(const StreamRow<T>& row) {
   l.step_size = 0;
   T* state = take(l.state + VW);
   T* tape = take(l.size + VW);
-  const Context<One> c{
-      s, p, row.packed, row.packed + p.stream - 2 * up(d.C, VW), l, take(work_size<One>(s))};
+  T* work = take(work_size<One>(s));
+  T* limits = take(range_size(s, d));
+  range<One>(s, d, row.low, row.high, limits);
+  const Context<One> c{s, p,      row.packed, row.packed + p.stream - 2 * up(d.C, VW), l, work,
+                       1, limits, limits + l.network};
   const int64_t place[3] = {0, l.h_at, l.c_at}, width[3] = {d.A, d.H, d.lstm ? d.H : 0};
   auto unpadded = [&](const T* from, T* to) {
     for (int k = 0; k < 3; ++k)

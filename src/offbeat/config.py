@@ -33,9 +33,17 @@ class ModelConfig:
         activation: nonlinearity of the vector field.
         solver: how the vector field is integrated over a gap: `euler`, `midpoint`, `heun`, `rk4`,
             `dopri5`, `tsit5`, or a registered tableau.
-        steps_per_gap: steps of a fixed-step solver over one gap.
-        max_step: longest step of a fixed-step solver, in model time; each gap then takes as many
-            equal steps as it needs, at least `steps_per_gap`.
+        nodes: where the steps of the solver begin. `observations`: at the last observed row, and
+            then every `max_step`; a row between two of these nodes is read by a further step that
+            is not kept. So a prediction depends on what was observed alone, bit for bit, whatever
+            other times are asked for. `rows`: at every row; each gap is divided into equal steps
+            (the thesis' protocol). By default `observations`, unless `update_rows`, `readout`,
+            `decay_rows` or `self_feeding` make a prediction depend on all rows anyway.
+        steps_per_gap: steps of a fixed-step solver over one gap; between nodes, over a typical one.
+        max_step: with nodes at observations, the distance of the nodes in model time; by default
+            `typical_gap` over `steps_per_gap`. There are 2048 of them; after the last one the state
+            stays as it is. With nodes at rows, the longest step: each gap takes as many equal steps
+            as it needs, at least `steps_per_gap`; by default there is no bound.
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver, in units of the state.
         gradient: `backprop` through the solver's steps, or the `adjoint` method (algorithm 1).
@@ -67,6 +75,9 @@ class ModelConfig:
             not (algorithms 2 and 3).
         gap_limit: time since the last observation saturates at this multiple of the longest one
             in training.
+        bounded: the vector field and the cell are given values within the range of training,
+            widened by half of it on each side, and no solver step leaves that range: a state cannot
+            run away after an outlier or in a long outage. On for models with a vector field.
     """
 
     name: str = "anchored_ode_gru_d"
@@ -79,6 +90,7 @@ class ModelConfig:
     field_units: tuple[int, ...] | None = None
     activation: Activation | None = None
     solver: str | None = None
+    nodes: Literal["observations", "rows"] | None = None
     steps_per_gap: int | None = None
     max_step: float | None = None
     rtol: float | None = None
@@ -97,6 +109,7 @@ class ModelConfig:
     typical_gap: float | None = None
     clock: Literal["first_observation", "first_row"] | None = None
     gap_limit: float | None = None
+    bounded: bool | None = None
 
     def __post_init__(self) -> None:
         for field_ in fields(self):
@@ -110,7 +123,7 @@ class ModelConfig:
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
         for name in ("max_step", "rtol", "atol", "typical_gap"):
             _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
-        for name in ("reset_after", "input_decay", "anchored"):
+        for name in ("reset_after", "input_decay", "anchored", "bounded"):
             value = getattr(self, name)
             if not (value is None or isinstance(value, bool)):
                 raise InputError(f"{name} must be true or false, got {value!r}")
@@ -132,6 +145,7 @@ class ModelConfig:
 
 _CHOICES: dict[str, tuple[str, ...]] = {
     "activation": ("tanh", "silu"),
+    "nodes": ("observations", "rows"),
     "gradient": ("backprop", "adjoint"),
     "decay": ("none", "trainable", "vector", "scalar"),
     "decay_rows": ("continuous", "every_row", "observed_rows"),

@@ -26,9 +26,6 @@ from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model
 from offbeat.ode import tableau
 
-MOST_STEPS = 256
-"""Maximum number of unrolled solver steps over one gap; a larger graph is slow to load."""
-
 
 def export_onnx(model: Model, path: str | Path) -> None:
     """Writes one streaming step of a model as an ONNX file, for `OnnxStream` or any ONNX runtime.
@@ -40,7 +37,8 @@ def export_onnx(model: Model, path: str | Path) -> None:
     values NaN, whose state is not used. The initial state, channel names, units and input
     transforms are JSON in the metadata under `offbeat`.
 
-    The graph is a trace of `model.forward` in the reference backend, for one row.
+    The graph is a trace of `model.forward` in the reference backend, for one row. The steps of the
+    solver from node to node are a loop in it.
 
     Args:
         model: trained.
@@ -48,8 +46,8 @@ def export_onnx(model: Model, path: str | Path) -> None:
 
     Raises:
         InputError: a model without a recurrent state or with actions; an adaptive solver, whose
-            number of steps is not fixed; more than 256 steps over a gap; self-feeding,
-            which draws random numbers; or another suffix.
+            number of steps is not known before; self-feeding, which draws random numbers; or
+            another suffix.
         MissingExtraError: onnx or onnxscript is not installed.
     """
     path = Path(path)
@@ -150,11 +148,10 @@ def _exact(value: Any) -> Any:
 
 @contextmanager
 def _traceable(model: Model) -> Iterator[None]:
-    """Runs a model in the reference backend, with a fixed number of solver steps."""
+    """Runs a model in the reference backend, with its solver steps as a loop."""
     spec = model.spec
     try:
-        if spec.max_step is not None:
-            model.spec = replace(spec, most_steps=most_steps(model))
+        model.spec = replace(spec, loops=bool(spec.field) and spec.max_step is not None)
         with kernels.use("reference"):
             yield
     finally:
@@ -173,15 +170,6 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         log.setLevel(level)
-
-
-def most_steps(model: Model) -> int:
-    """Number of solver steps over the longest gap of a model."""
-    if model.spec.max_step is None:
-        return model.spec.steps_per_gap
-    longest = model.statistics.longest_elapsed * float(model.config.gap_limit or 1)
-    needed = math.ceil(longest / model.time_unit / model.spec.max_step - 1e-6)
-    return max(model.spec.steps_per_gap, needed)
 
 
 def _record(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
@@ -222,13 +210,7 @@ def _check_exportable(model: Model) -> None:
         return
     if tableau(model.spec.solver).adaptive:
         raise InputError(
-            f"the solver {model.spec.solver!r} takes as many steps as a gap needs, and an ONNX "
-            "graph has a fixed number of them; train or load the model with a solver of fixed "
+            f"the solver {model.spec.solver!r} chooses its steps by their errors, which an ONNX "
+            "graph cannot; train or load the model with a solver of fixed "
             "steps (euler, midpoint, heun, rk4), or stream it with offbeat.Stream"
-        )
-    steps = most_steps(model)
-    if steps > MOST_STEPS:
-        raise InputError(
-            f"max_step={model.spec.max_step} makes up to {steps} steps over a gap, more than the "
-            f"{MOST_STEPS} that are written out; use a longer max_step, or offbeat.Stream"
         )

@@ -180,6 +180,9 @@ def compiled_spec(spec: ScanSpec) -> Any:
         b=list(scheme.b),
         steps=spec.steps_per_gap,
         max_step=spec.max_step or 0.0,
+        nodes=spec.nodes,
+        decay_span=spec.decay_span,
+        bounded=spec.bounded,
         decay_features=spec.decay,
         decay_rows=_DECAY_ROWS[spec.decay_rows],
         input_decay=spec.input_decay,
@@ -209,9 +212,12 @@ def _inputs(rows: StepInputs | TableSteps, suffix: str) -> Any:
             _array(table.mean),
             fed,
             _array(rows.length),
+            _array(table.low),
+            _array(table.high),
         )
-    given = (_array(getattr(rows, name)) for name in QUANTITIES)
-    return made(*given, _array(rows.mean), fed, _array(rows.length))
+    names = (*QUANTITIES, "mean", "length", "low", "high")
+    given = {name: _array(getattr(rows, name)) for name in names}
+    return made(**given, use_prediction=fed)
 
 
 class _Scan(Function):

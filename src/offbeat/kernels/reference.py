@@ -5,7 +5,7 @@ decay -> dynamics over the gap -> (predictions are read here) -> cell at an obse
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import linear, silu
 
 from offbeat.kernels.spec import (
+    HIDDEN_LIMIT,
     LARGEST_EXPONENT,
     Layers,
     ScanCell,
@@ -33,7 +34,9 @@ def scan(
     """Propagates a batch of states over all steps, for any spec; see `offbeat.kernels.scan`."""
     before: list[Tensor] = []
     after: list[Tensor] = []
-    decays = _decays(spec, parts, inputs)
+    dynamics = _Dynamics.of(spec, parts, inputs)
+    nodes = _Nodes.of(spec, parts, inputs) if spec.nodes else None
+    decays = _decays(spec, parts, inputs) if nodes is None else [None] * inputs.rows
     gates = _gates(spec, parts, inputs)
     each_gate = [None] * inputs.rows if gates is None else gates.unbind(1)
     gaps, updates = inputs.gap[..., None].unbind(1), inputs.update[..., None].unbind(1)
@@ -43,16 +46,21 @@ def scan(
         old = state
         if inputs.fed and inputs.fed[i]:
             gate = _fed_gate(spec, parts, inputs, state, i)
-        state = _propagate(spec, parts, gap, decay, state)
+        if nodes is None:
+            arrived = _propagate(dynamics, gap, decay, state)
+        else:
+            state, arrived = nodes.propagate(dynamics, i, state)
         valid = None
         if i >= shortest and inputs.length is not None:
             valid = (inputs.length > i)[:, None]
-            state = torch.where(valid, state, old)
-        before.append(state)
+            arrived, state = torch.where(valid, arrived, old), torch.where(valid, state, old)
+        before.append(arrived)
+        updated = arrived
         if parts.cell is not None and gate is not None:
             observed = (inputs.values[:, i], inputs.mask[:, i]) if spec.anchored else None
-            updated = _update(spec, parts.cell, gate, update, observed, state)
-            state = updated if valid is None else torch.where(valid, updated, state)
+            updated = _update(dynamics, parts.cell, gate, update, observed, arrived)
+            updated = updated if valid is None else torch.where(valid, updated, arrived)
+        state = updated if nodes is None else torch.where(nodes.commit[i], updated, state)
         after.append(state)
     return torch.stack(before, dim=1), torch.stack(after, dim=1)
 
@@ -84,6 +92,8 @@ def _gates(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Tensor | Non
     if parts.cell is None:
         return None
     shown = _decayed(parts, inputs) if spec.input_decay else inputs.values
+    if inputs.low is not None and inputs.high is not None:
+        shown = torch.clamp(shown, inputs.low, inputs.high)
     return parts.cell.project(_input(inputs, shown, slice(None)))
 
 
@@ -169,10 +179,252 @@ def _fed_gate(
 # --- over the gap ---------------------------------------------------------------------------------
 
 
-def _propagate(
-    spec: ScanSpec, parts: ScanParts, gap: Tensor, decay: Decay, state: Tensor
-) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class _Dynamics:
+    """The vector field of a scan, and the range that it keeps the state in.
+
+    Attributes:
+        spec: of the scan.
+        field: the vector field of (x, h), or None.
+        parameters: for the adjoint method, else None.
+        low: (driven,) lower bounds of (x, h), or None.
+        high: (driven,) upper bounds.
+        numbers: the constants of a step as tensors, for tracing: the exporter rounds numbers inside
+            of a loop to single precision.
+    """
+
+    spec: ScanSpec
+    field: Field | None
+    parameters: Sequence[Tensor] | None
+    low: Tensor | None
+    high: Tensor | None
+    numbers: Mapping[float, Tensor]
+
+    @classmethod
+    def of(cls, spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> _Dynamics:
+        low = high = None
+        if spec.bounded:
+            hidden = inputs.gap.new_full((spec.hidden_size,), HIDDEN_LIMIT)
+            low, high = -hidden, hidden
+            if spec.anchored:
+                low = torch.cat([_given(inputs.low), low])
+                high = torch.cat([_given(inputs.high), high])
+        if not spec.field:
+            return cls(spec, None, None, low, high, {})
+        vector_field = parts.field
+        if vector_field is None:
+            raise ValueError("a vector field needs ScanParts.field")
+
+        def field(_: Tensor, y: Tensor) -> Tensor:
+            if low is not None and high is not None:
+                y = _clamped(y, low, high)
+            return vector_field(y)
+
+        parameters = list(field_tensors(vector_field)) if spec.adjoint else None
+        numbers = {}
+        if spec.loops:
+            scheme = tableau(spec.solver)
+            each = {w for row in (*scheme.a, scheme.b) for w in row}
+            numbers = {w: torch.tensor(w, dtype=torch.float64) for w in each}
+        return cls(spec, field, parameters, low, high, numbers)
+
+    def step(self, state: Tensor, span: Tensor) -> Tensor:
+        """One step of the solver, or as many as an adaptive one needs, of (batch, 1) `span`."""
+        if self.field is None:
+            return state
+        spec = self.spec
+        if spec.loops:
+            return self.within(state, self._traced_step(self.field, state, span))
+        moved = solve(
+            self.field,
+            state,
+            span,
+            tableau(spec.solver),
+            rtol=spec.rtol,
+            atol=spec.atol,
+            adjoint_parameters=self.parameters,
+        )
+        return self.within(state, moved)
+
+    def _traced_step(self, field: Field, y: Tensor, span: Tensor) -> Tensor:
+        """One step with weights from `numbers`."""
+        scheme = tableau(self.spec.solver)
+        slopes: list[Tensor] = []
+        for weights in (*scheme.a, scheme.b):
+            state = y
+            for slope, weight in zip(slopes, weights, strict=True):
+                if weight != 0:
+                    state = state + span * (slope * self.numbers[weight])
+            if len(slopes) == len(scheme.b):
+                break
+            slopes.append(field(span, state))
+        return state
+
+    def within(self, state: Tensor, moved: Tensor) -> Tensor:
+        """`moved`, stopped where it leaves the range; outside of it, it can only move back."""
+        if self.low is None or self.high is None:
+            return moved
+        least = torch.where(state < self.low, state, self.low)
+        most = torch.where(state > self.high, state, self.high)
+        moved = torch.where(moved < least, least, moved)
+        return torch.where(moved > most, most, moved)
+
+
+def _clamped(y: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """`y` within its range, with no gradient at and beyond its ends."""
+    inside = (y > low) & (y < high)
+    return torch.where(inside, y, torch.clamp(y.detach(), low, high))
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """The steps to each row over the nodes of the solver, and from the last of them to the row.
+
+    Attributes:
+        first: per row (batch, 1) the number of the node that the state has reached.
+        last: per row (batch, 1) the number of the last node before the row.
+        rest: per row (batch, 1) model time from there to the row.
+        whole: per row the largest number of steps from node to node.
+        commit: per row (batch, 1) True where the state of the row is kept.
+        decay: per row the exponents, or None: at the last observed row, `decay_span` later
+            (batch, hidden), and (batch, 1) 1.0 where the cell acted at that row.
+    """
+
+    first: Sequence[Tensor]
+    last: Sequence[Tensor]
+    rest: Sequence[Tensor]
+    whole: Sequence[int]
+    commit: Sequence[Tensor]
+    decay: Sequence[tuple[Tensor, Tensor, Tensor]] | None
+
+    @classmethod
+    def of(cls, spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> _Nodes:
+        first, last, commit = (
+            _given(tensor)[..., None] for tensor in (inputs.first_node, inputs.node, inputs.commit)
+        )
+        decay = None
+        if spec.decay:
+            if parts.decay is None:
+                raise ValueError("a decay needs ScanParts.decay")
+            start = linear(_given(inputs.decay_start), *parts.decay)
+            end = linear(_given(inputs.decay_end), *parts.decay)
+            fresh = _given(inputs.updated)[..., None]
+            each = zip(start.unbind(1), end.unbind(1), fresh.unbind(1), strict=True)
+            decay = list(each)
+        whole = [0] * inputs.rows
+        if spec.max_step is not None and not spec.loops:
+            whole = [int(n) for n in (last - first).amax(dim=(0, 2)).tolist()]
+        return cls(
+            first.unbind(1),
+            last.unbind(1),
+            inputs.gap[..., None].unbind(1),
+            whole,
+            (commit > 0).unbind(1),
+            decay,
+        )
+
+    def propagate(self, dynamics: _Dynamics, i: int, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The state of the last node before row `i`, and the state at the row."""
+        spec, first, last = dynamics.spec, self.first[i], self.last[i]
+        driven = spec.anchors + spec.hidden_size
+        memory, y = state[:, driven:], state[:, :driven]
+        decay = None if self.decay is None else self.decay[i]
+        applied = None if decay is None else _applied(spec, *decay, first)
+        length = torch.ones_like(first) * (spec.max_step or 1.0)
+        unit = torch.ones_like(first) * spec.decay_span
+        none = torch.zeros_like(first)
+
+        def step(node: Tensor, y: Tensor, *applied: Tensor) -> tuple[Tensor, ...]:
+            active = node < last
+            span = torch.where(active, length, none)
+            if decay is not None:
+                since = (node + 1) * length / unit
+                reached = _exponent(decay[0] + since * (decay[1] - decay[0]))
+                grown = torch.where(active, (reached - applied[0]).clamp_min(0.0), 0.0)
+                y = _scale_hidden(spec, y, torch.exp(-grown))
+                reached = torch.where(active, torch.maximum(applied[0], reached), applied[0])
+                applied = (reached,)
+            return (node + 1, dynamics.step(y, span), *applied)
+
+        carried: tuple[Tensor, ...] = (first, y) if applied is None else (first, y, applied)
+        if spec.loops:
+            carried = _while(lambda node, *_: (node < last).any(), step, carried)
+        for _ in range(self.whole[i]):
+            carried = step(*carried)
+        node_state, applied = carried[1], carried[2] if decay is not None else None
+        if decay is None:
+            arrived = dynamics.step(node_state, self.rest[i])
+        else:
+            assert applied is not None
+            arrived = self._read(dynamics, i, node_state, decay, applied)
+        if memory.shape[1]:
+            node_state = torch.cat([node_state, memory], dim=1)
+            arrived = torch.cat([arrived, memory], dim=1)
+        return node_state, arrived
+
+    def _read(
+        self,
+        dynamics: _Dynamics,
+        i: int,
+        y: Tensor,
+        decay: tuple[Tensor, Tensor, Tensor],
+        applied: Tensor,
+    ) -> Tensor:
+        """The step from the last node to row `i` with its decay."""
+        spec, rest = dynamics.spec, self.rest[i]
+        start, end, _ = decay
+        reached = _along(spec, start, end, self.last[i], rest)
+        if spec.field and tableau(spec.solver).adaptive:
+            # The adjoint takes gradients for both ends, so one must not be computed from the other.
+            along = DecayAlongGap(start.clone(), reached, applied)
+            return _solve_damped(dynamics, rest, along, y)
+        y = _scale_hidden(spec, y, torch.exp(-_growth(reached, applied)))
+        return dynamics.step(y, rest)
+
+
+def _along(spec: ScanSpec, start: Tensor, end: Tensor, node: Tensor, rest: Tensor) -> Tensor:
+    """The exponent `rest` after a node, before the maximum."""
+    since = node * (spec.max_step or 1.0) + rest
+    return start + since / spec.decay_span * (end - start)
+
+
+def _applied(spec: ScanSpec, start: Tensor, end: Tensor, fresh: Tensor, node: Tensor) -> Tensor:
+    """The part of the exponent that has been applied to the state of a node.
+
+    It is the largest exponent of the nodes so far: of the last one if it grows, else of the first.
+    After an update of the cell, nothing of it has been applied.
+    """
+    none = torch.zeros_like(node)
+    last = _along(spec, start, end, node, none)
+    first = torch.where(fresh > 0, _along(spec, start, end, none + 1, none), start)
+    along = torch.where(end >= start, last, first)
+    before = torch.where(fresh > 0, torch.zeros_like(start), _exponent(start))
+    return torch.where(node > 0, _exponent(along), before)
+
+
+def _while(
+    condition: Callable[..., Tensor],
+    step: Callable[..., tuple[Tensor, ...]],
+    carried: tuple[Tensor, ...],
+) -> tuple[Tensor, ...]:
+    """A loop that the exporter keeps as a loop."""
+    if torch.compiler.is_exporting():
+        from torch._higher_order_ops.while_loop import while_loop
+
+        # Export would make the sizes inside of the loop variables.
+        with torch._dynamo.config.patch(
+            assume_static_by_default=True, automatic_dynamic_shapes=False
+        ):
+            found: tuple[Tensor, ...] = while_loop(condition, step, carried)  # type: ignore[no-untyped-call]
+            return found
+    while bool(condition(*carried)):
+        carried = step(*carried)
+    return carried
+
+
+def _propagate(dynamics: _Dynamics, gap: Tensor, decay: Decay, state: Tensor) -> Tensor:
     """Decay and dynamics of (x, h) over one gap; the memory of a cell does not change."""
+    spec = dynamics.spec
     if isinstance(decay, Tensor):
         state = _scale_hidden(spec, state, decay)
         decay = None
@@ -180,53 +432,36 @@ def _propagate(
         return state
     driven = spec.anchors + spec.hidden_size
     memory = state[:, driven:]
-    state = state[:, :driven]
-    state = _solve(spec, parts, gap, decay, state)
+    state = _solve(dynamics, gap, decay, state[:, :driven])
     return torch.cat([state, memory], dim=1) if memory.shape[1] else state
 
 
-def _solve(
-    spec: ScanSpec,
-    parts: ScanParts,
-    gap: Tensor,
-    decay: DecayAlongGap | None,
-    state: Tensor,
-) -> Tensor:
-    vector_field = parts.field
-    if vector_field is None:
-        raise ValueError("a vector field needs ScanParts.field")
-
-    def field(_: Tensor, y: Tensor) -> Tensor:
-        return vector_field(y)
-
-    scheme = tableau(spec.solver)
-    parameters = list(field_tensors(vector_field)) if spec.adjoint else None
-    if scheme.adaptive and decay is not None:
-        return _solve_damped(spec, field, parameters, gap, decay, state)
+def _solve(dynamics: _Dynamics, gap: Tensor, decay: DecayAlongGap | None, state: Tensor) -> Tensor:
+    spec = dynamics.spec
+    if tableau(spec.solver).adaptive:
+        if decay is not None:
+            return _solve_damped(dynamics, gap, decay, state)
+        return dynamics.step(state, gap)
     steps: int | Tensor = spec.steps_per_gap
     if spec.max_step is not None:
         steps = torch.ceil(gap / spec.max_step - 1e-6).clamp_min(spec.steps_per_gap).long()
-    if decay is not None:
-        return _solve_split(spec, field, parameters, gap, decay, state, steps)
+    if decay is not None or spec.bounded or spec.loops:
+        return _solve_split(dynamics, gap, decay, state, steps)
+    assert dynamics.field is not None
     return solve(
-        field,
+        dynamics.field,
         state,
         gap,
-        scheme,
+        tableau(spec.solver),
         steps=steps,
-        most_steps=spec.most_steps,
-        rtol=spec.rtol,
-        atol=spec.atol,
-        adjoint_parameters=parameters,
+        adjoint_parameters=dynamics.parameters,
     )
 
 
 def _solve_split(
-    spec: ScanSpec,
-    field: Field,
-    parameters: Sequence[Tensor] | None,
+    dynamics: _Dynamics,
     gap: Tensor,
-    decay: DecayAlongGap,
+    decay: DecayAlongGap | None,
     state: Tensor,
     steps: int | Tensor,
 ) -> Tensor:
@@ -234,29 +469,34 @@ def _solve_split(
 
     With one step per gap and every row observed this is algorithm 3 of the thesis.
     """
-    start, end, applied = decay.start, decay.end, decay.applied
-    most = steps if isinstance(steps, int) else spec.most_steps or int(steps.max())
-    for k in range(1, most + 1):
-        part = k / steps if isinstance(steps, int) else (k / steps.to(gap)).clamp_max(1.0)
-        reached = start + part * (end - start)
-        state = _scale_hidden(spec, state, torch.exp(-_growth(reached, applied)))
-        applied = torch.maximum(applied, _exponent(reached))
-        step = gap / steps
-        if not isinstance(steps, int):
-            step = torch.where(k <= steps, step, torch.zeros_like(step))
-        state = solve(field, state, step, tableau(spec.solver), adjoint_parameters=parameters)
-    return state
+    spec = dynamics.spec
+    counts = steps.to(gap) if isinstance(steps, Tensor) else torch.full_like(gap, steps)
+    length = gap / counts
+
+    def step(done: Tensor, y: Tensor, *applied: Tensor) -> tuple[Tensor, ...]:
+        if decay is not None:
+            part = ((done + 1) / counts).clamp_max(1.0)
+            reached = decay.start + part * (decay.end - decay.start)
+            y = _scale_hidden(spec, y, torch.exp(-_growth(reached, applied[0])))
+            applied = (torch.maximum(applied[0], _exponent(reached)),)
+        span = torch.where(done < counts, length, torch.zeros_like(length))
+        return (done + 1, dynamics.step(y, span), *applied)
+
+    done = torch.zeros_like(gap)
+    carried: tuple[Tensor, ...] = (done, state)
+    if decay is not None:
+        carried = (done, state, decay.applied)
+    if spec.loops and isinstance(steps, Tensor):
+        return _while(lambda done, *_: (done < counts).any(), step, carried)[1]
+    for _ in range(int(counts.max()) if isinstance(steps, Tensor) else steps):
+        carried = step(*carried)
+    return carried[1]
 
 
-def _solve_damped(
-    spec: ScanSpec,
-    field: Field,
-    parameters: Sequence[Tensor] | None,
-    gap: Tensor,
-    decay: DecayAlongGap,
-    state: Tensor,
-) -> Tensor:
+def _solve_damped(dynamics: _Dynamics, gap: Tensor, decay: DecayAlongGap, state: Tensor) -> Tensor:
     """The limit of short split steps, adaptive: h = exp(-E(s)) u, solved for u."""
+    spec, field, parameters = dynamics.spec, dynamics.field, dynamics.parameters
+    assert field is not None
     start, end, applied = decay.start, decay.end, decay.applied
     state = _scale_hidden(spec, state, torch.exp(-_growth(start, applied)))
 
@@ -280,7 +520,8 @@ def _solve_damped(
         atol=spec.atol,
         adjoint_parameters=parameters,
     )
-    return _scale_hidden(spec, u, torch.exp(-exponent(torch.ones_like(gap))))
+    moved = _scale_hidden(spec, u, torch.exp(-exponent(torch.ones_like(gap))))
+    return dynamics.within(state, moved)
 
 
 def _exponent(a: Tensor) -> Tensor:
@@ -309,7 +550,7 @@ def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
 
 
 def _update(
-    spec: ScanSpec,
+    dynamics: _Dynamics,
     cell: ScanCell,
     gate: Tensor,
     update: Tensor,
@@ -319,9 +560,14 @@ def _update(
     """The state after an observation; x of an anchored state takes the observed values."""
     if observed is None:
         return cell.step(gate, state, update)
-    x, rest = state[:, : spec.anchors], state[:, spec.anchors :]
+    anchors = dynamics.spec.anchors
+    x, rest = state[:, :anchors], state[:, anchors:]
     value, mask = observed
     if cell.innovation is not None:
-        gate = torch.addmm(gate, mask * (value - x), cell.innovation.t())
+        shown, expected = value, x
+        if dynamics.low is not None and dynamics.high is not None:
+            low, high = dynamics.low[:anchors], dynamics.high[:anchors]
+            shown, expected = torch.clamp(value, low, high), _clamped(x, low, high)
+        gate = torch.addmm(gate, mask * (shown - expected), cell.innovation.t())
     rest = cell.step(gate, rest, update)
     return torch.cat([torch.lerp(x, value, mask), rest], dim=1)

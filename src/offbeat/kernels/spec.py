@@ -23,6 +23,12 @@ from torch import Tensor
 LARGEST_EXPONENT = 30.0
 """Upper bound of decay exponents: exp(-30) is negligible, and exp(30) is finite."""
 
+MOST_NODES = 2048
+"""Number of solver nodes after an observed row; beyond the last one the state stays as it is."""
+
+HIDDEN_LIMIT = 10.0
+"""Bound of a hidden unit in a bounded scan."""
+
 
 @dataclass(frozen=True)
 class ScanSpec:
@@ -43,9 +49,15 @@ class ScanSpec:
         activation: nonlinearity between the layers of the vector field.
         solver: name of a tableau.
         steps_per_gap: minimum number of equal steps of a fixed-step solver over one gap.
-        max_step: longest such step, model time; None for no bound.
-        most_steps: a bound on the steps of `max_step` for tracing; the reference
-            backend takes this number of steps, the last ones of length 0.
+        max_step: longest such step, model time; None for no bound. With `nodes`, the distance of
+            the nodes.
+        nodes: the state is propagated from node to node, at multiples of `max_step` after the last
+            observed row. A row reads it by a further step from the last node before the row, which
+            is not kept. So a row in which nothing is observed changes no bit of the others.
+        decay_span: model time between `decay_start` and `decay_end`; with `nodes` only.
+        bounded: the vector field and the cell are given values within `StepInputs.low` and `high`
+            and hidden units within `HIDDEN_LIMIT`, and no solver step leaves these ranges.
+        loops: solver steps are a loop whose length is data, for tracing; reference backend only.
         rtol: relative tolerance of an adaptive solver.
         atol: absolute tolerance of an adaptive solver.
         adjoint: gradients of the vector field's solution by the adjoint method.
@@ -72,7 +84,10 @@ class ScanSpec:
     solver: str = "euler"
     steps_per_gap: int = 1
     max_step: float | None = None
-    most_steps: int | None = None
+    nodes: bool = False
+    decay_span: float = 1.0
+    bounded: bool = False
+    loops: bool = False
     rtol: float = 1e-4
     atol: float = 1e-6
     adjoint: bool = False
@@ -179,6 +194,9 @@ QUANTITIES = (
     "decay_end",
     "delta",
     "last",
+    "first_node",
+    "node",
+    "commit",
 )
 """Names of the step inputs, in the order of the compiled code."""
 
@@ -188,17 +206,27 @@ class StepInputs:
     """The inputs of each step, which do not depend on trained parameters.
 
     Attributes:
-        gap: (batch, rows) model time since the step before, saturated.
+        gap: (batch, rows) model time since the step before, saturated; with nodes, since the last
+            node before the row.
         update: (batch, rows) 1.0 where the cell acts, else 0.0.
         values: (batch, rows, channels) observed values, 0 elsewhere.
         mask: (batch, rows, channels) 1.0 where observed, else 0.0.
         time_input: (batch, rows, time_inputs) times since observation for the cell, or None.
-        updated: (batch, rows) 1.0 where the cell acted at the step before; with a decay only.
-        decay_start: (batch, rows, decay) inputs of the decay at the start of the gap.
-        decay_end: (batch, rows, decay) the same at its end.
+        updated: (batch, rows) 1.0 where the cell acted at the step before; with a decay only. With
+            nodes, at the last step whose state was kept.
+        decay_start: (batch, rows, decay) inputs of the decay at the start of the gap; with nodes,
+            right after the last observed row.
+        decay_end: (batch, rows, decay) the same at its end; with nodes, `decay_span` later.
         delta: (batch, rows, channels) model time since each channel's last observation, with
             `input_decay` only.
         last: (batch, rows, channels) last value of each channel; with `input_decay` only.
+        first_node: (batch, rows) number of the node that the state has reached, counted from the
+            last observed row; with `nodes` only, as are the next two.
+        node: (batch, rows) number of the last node before the row.
+        commit: (batch, rows) 1.0 where the state of the row is kept, which is where something is
+            observed; elsewhere the state of the node is.
+        low: (channels,) lower bounds of the values; with `bounded` and `anchored` only.
+        high: (channels,) upper bounds of the values.
         mean: (channels,) value that last values decay to; with `input_decay` only.
         length: (batch,) int64, rows of each trajectory; later rows are padding and do not change
             the state. None: all rows count.
@@ -216,6 +244,11 @@ class StepInputs:
     decay_end: Tensor | None = None
     delta: Tensor | None = None
     last: Tensor | None = None
+    first_node: Tensor | None = None
+    node: Tensor | None = None
+    commit: Tensor | None = None
+    low: Tensor | None = None
+    high: Tensor | None = None
     mean: Tensor | None = None
     length: Tensor | None = None
     fed: tuple[bool, ...] = ()
@@ -239,6 +272,22 @@ class StepInputs:
                 yield tensor
 
 
+def nodes_before(time: Tensor) -> tuple[Tensor, Tensor]:
+    """The last solver node at or before each time.
+
+    Args:
+        time: float64, in units of `max_step` after an observed row, at least 0.
+
+    Returns:
+        The number of the node, which lies at that time, and the time since then; less than a
+        millionth of a step counts as 0. Beyond `MOST_NODES` no time passes.
+    """
+    time = time.clamp_max(MOST_NODES)
+    node = torch.floor(time + 1e-6)
+    left = time - node
+    return node, torch.where(left < 1e-6, torch.zeros_like(left), left)
+
+
 @dataclass(frozen=True, eq=False)
 class StepTable:
     """The step inputs of many trajectories in one tensor, so that a batch is one gather.
@@ -246,12 +295,16 @@ class StepTable:
     Attributes:
         table: (trajectories, rows, columns), with contiguous columns.
         places: per input, its name, its columns, and whether it has an axis of units.
+        low: as `StepInputs.low`.
+        high: as `StepInputs.high`.
         mean: as `StepInputs.mean`.
         length: as `StepInputs.length`.
     """
 
     table: Tensor
     places: tuple[tuple[str, slice, bool], ...]
+    low: Tensor | None
+    high: Tensor | None
     mean: Tensor | None
     length: Tensor | None
 
@@ -273,7 +326,8 @@ class StepTable:
                 columns.append(column)
                 width += column.shape[2]
             places.append((name, known[id(value)], value.ndim == 3))
-        return cls(torch.cat(columns, dim=2), tuple(places), rows.mean, rows.length)
+        fixed = (rows.low, rows.high, rows.mean, rows.length)
+        return cls(torch.cat(columns, dim=2), tuple(places), *fixed)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -324,7 +378,9 @@ class TableSteps:
             name: table[..., at] if units else table[..., at.start]
             for name, at, units in self.table.places
         }
-        return StepInputs(**given, mean=self.table.mean, length=self.length, fed=self.fed)
+        whole = self.table
+        given |= {"low": whole.low, "high": whole.high, "mean": whole.mean}
+        return StepInputs(**given, length=self.length, fed=self.fed)
 
     def known(self) -> Iterator[Tensor]:
         """All tensors of numbers that are present."""

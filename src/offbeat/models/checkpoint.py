@@ -146,7 +146,10 @@ def _build(record: dict[str, Any]) -> BaseModel:
     )
     if "inner" in record["model"]:
         return CorrectedModel.restored(record["model"]["inner"], record["model"]["base"], data)
-    return build(record["name"], record["model"], data)
+    config = record["model"]
+    if "name" in config:  # a composed model, perhaps of a version without these options
+        config = {"nodes": "rows", "bounded": False, **config}
+    return build(record["name"], config, data)
 
 
 _RENAMED = {"age_input": "time_input", "age_unit": "time_input_unit"}

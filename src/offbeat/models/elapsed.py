@@ -3,6 +3,10 @@
 By default the model's clock starts at the first observation. After it,
 time since the last observed row saturates at a limit, and a gap is the growth of that saturated
 time. So rows in which nothing is observed can be inserted anywhere without effect.
+
+The nodes of a solver lie at fixed times after the last observed row (`kernels.spec.nodes_before`).
+Which of them a row is read from, and the time from there to the row, are computed in float64 from
+that one time alone, so they do not depend on other rows either.
 """
 
 from __future__ import annotations
@@ -20,13 +24,14 @@ class RecurrentState:
     """The state of a model after the rows it has processed.
 
     Attributes:
-        state: (batch, state_size).
+        state: (batch, state_size); with solver nodes at observations, that of the last node.
         time: (batch,) float64, s, of the last row; NaN before the first.
         start: (batch,) float64, s, at which the clock started; +inf before.
         observed_at: (batch,) float64, s, of the last observed row; -inf before the first.
         channel_at: (batch, channels) float64, s, of each channel's last observation; -inf before.
         last: (batch, channels) last observed value of each channel; the training mean before.
-        updated: (batch,) bool, True if the cell acted at the last row.
+        updated: (batch,) bool, True if the cell acted at the last row; with solver nodes at
+            observations, at the last observed row.
         rows: number of processed rows.
         generator: of self-feeding, or None.
         actions: (batch, channels) values of the last row in channels with the role `action`, NaN
@@ -89,6 +94,8 @@ class ElapsedTimes:
             arrival; over a gap it
             grows as long as `elapsed` does.
         delta_before: (batch, rows, channels) the same at the row before, after its observation.
+        delta_observed: (batch, rows, channels) the same at the last observed row, after its
+            observation.
         last: (batch, rows, channels) last value of each channel on arrival.
     """
 
@@ -100,6 +107,7 @@ class ElapsedTimes:
     elapsed_before: Tensor
     delta: Tensor
     delta_before: Tensor
+    delta_observed: Tensor
     last: Tensor
 
 
@@ -149,6 +157,7 @@ def elapsed_times(
         elapsed_before=elapsed_before,
         delta=delta.clamp_min(0),
         delta_before=delta_before.clamp_min(0),
+        delta_observed=(torch.minimum(clock, times)[..., None] - channel_clock).clamp_min(0),
         last=last,
     )
     ended = RecurrentState(
@@ -164,6 +173,17 @@ def elapsed_times(
         actions=past.actions,
     )
     return result, ended
+
+
+def at_last(flag: Tensor, rows: Tensor, past: Tensor) -> Tensor:
+    """(batch, rows) `flag` at the latest earlier row of `rows`; `past` where there was none.
+
+    Args:
+        flag: (batch, rows).
+        rows: (batch, rows) bool.
+        past: (batch,).
+    """
+    return _pick(flag, last_index(rows[..., None])[..., 0], past[:, None])
 
 
 def _saturate(elapsed: Tensor, limit: float) -> tuple[Tensor, Tensor]:

@@ -27,8 +27,9 @@ from offbeat.kernels import (
     choose,
     scan,
 )
+from offbeat.kernels.spec import MOST_NODES, nodes_before
 from offbeat.models.base import BaseModel, DataInfo
-from offbeat.models.elapsed import ElapsedTimes, RecurrentState, elapsed_times
+from offbeat.models.elapsed import ElapsedTimes, RecurrentState, at_last, elapsed_times
 from offbeat.ode import tableau
 from offbeat.parts import CELLS, FIELDS, HEADS, Cell, HeadShape, Perceptron, Prediction
 from offbeat.parts.decay import ExponentialDecay, InputDecay, TrainableDecay
@@ -42,13 +43,21 @@ class Output(Prediction):
         mean: (batch, rows, channels) scaled units; the value expected at each row.
         scale: (batch, rows, channels) of heads that have one; else None.
         before: (batch, rows, state_size) state before the observation of each row.
-        after: (batch, rows, state_size) state after each row.
+        after: (batch, rows, state_size) state after each row; with solver nodes at observations, of
+            the last node before a row in which nothing is observed.
         past: recurrent state for later rows; None from `run`.
     """
 
     before: Tensor | None = None
     after: Tensor | None = None
     past: RecurrentState | None = None
+
+
+WIDENING = 0.5
+"""Fraction of the range of training by which the range of a bounded model is wider on each side."""
+
+LARGEST_VALUE = 1e15
+"""Bound of the values of a bounded model, in units of their spread; keeps sums finite."""
 
 
 class Model(BaseModel):
@@ -63,6 +72,9 @@ class Model(BaseModel):
         InputError: a field of the config is None, or parts are incompatible.
     """
 
+    low: Tensor
+    high: Tensor
+
     def __init__(self, config: ModelConfig, data: DataInfo, *, seed: int = 0) -> None:
         super().__init__(config.name, data)
         _check(config)
@@ -75,7 +87,10 @@ class Model(BaseModel):
         self.decay = _decay(config, channels, hidden)
         self.input_decay = InputDecay(channels) if config.input_decay else None
         kind = CELLS["start" if config.cell == "none" else config.cell or "gru"]
-        self.spec = _spec(config, channels, self.decay, kind)
+        self.elapsed_limit = statistics.longest_elapsed * float(config.gap_limit or 1)
+        self.spec = _spec(
+            config, channels, self.decay, kind, longest=self.elapsed_limit / self.time_unit
+        )
         anchored = self.spec.anchors
         self.cell = kind(
             2 * channels + self.spec.time_inputs,
@@ -99,7 +114,29 @@ class Model(BaseModel):
             actions=tuple(i for i, role in enumerate(self.roles) if role == ACTION),
         )
         self.head = HEADS[config.head or "point"](shape)
+        low, high = self._range()
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
         self._initialise(seed)
+
+    def _range(self) -> tuple[Tensor, Tensor]:
+        """(channels,) bounds of the values, in the units that the cell is given them in."""
+        infinite = torch.full((self.channels,), torch.inf)
+        if not self.spec.bounded:
+            return -infinite, infinite
+        low, high = (
+            torch.tensor(bound, dtype=torch.float64)
+            for bound in (self.statistics.low, self.statistics.high)
+        )
+        wider = WIDENING * (high - low)
+        low, high = low - wider, high + wider
+        if self.spec.anchored:
+            mean, std = (
+                torch.tensor(v, dtype=torch.float64)
+                for v in (self.statistics.mean, self.statistics.std)
+            )
+            low, high = (low - mean) / std, (high - mean) / std
+        return low.to(self.mean.dtype), high.to(self.mean.dtype)
 
     def _initialise(self, seed: int) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -196,8 +233,7 @@ class Model(BaseModel):
         inputs, ended = self.step_inputs(batch, past)
         output = self.run(inputs, past.state, generator=past.generator, seen=past.rows)
         assert output.after is not None
-        ended = replace(ended, state=output.after[:, -1], updated=inputs.update[:, -1] > 0)
-        return replace(output, past=ended)
+        return replace(output, past=replace(ended, state=output.after[:, -1]))
 
     def prepare(self, batch: Batch) -> StepTable:
         """The step inputs of a batch in one table.
@@ -236,7 +272,12 @@ class Model(BaseModel):
         found = self.head.decode(read)
         if self.acts:
             # An action is chosen at its row, so it is decoded after the observation there.
-            then = self.head.decode(after)
+            now = after
+            if self.spec.nodes:
+                commit = prepared.gathered().commit
+                assert commit is not None
+                now = torch.where(commit[..., None] > 0, after, before)
+            then = self.head.decode(now)
             acts = torch.tensor([role == ACTION for role in self.roles], device=after.device)
             scale = found.scale
             if scale is not None and then.scale is not None:
@@ -286,13 +327,18 @@ class Model(BaseModel):
         at_rows, ended = elapsed_times(
             batch,
             past,
-            elapsed_limit=self.statistics.longest_elapsed * float(config.gap_limit or 1),
+            elapsed_limit=self.elapsed_limit,
             from_first_row=config.clock == "first_row",
         )
         mask = batch.mask & batch.valid[..., None]
-        values = torch.where(mask, batch.values, 0.0)
+        values, last = torch.where(mask, batch.values, 0.0), at_rows.last
         if spec.anchored:
             values = torch.where(mask, (batch.values - self.mean) / self.std, 0.0)
+        if spec.bounded and spec.anchored:
+            values = values.clamp(-LARGEST_VALUE, LARGEST_VALUE)
+        elif spec.bounded:
+            values = torch.where(mask, values.clamp(self.low, self.high), 0.0)
+            last = last.clamp(self.low, self.high)
         update = at_rows.observed
         if config.cell == "none":
             update = at_rows.first
@@ -307,24 +353,52 @@ class Model(BaseModel):
             # A single row has no padding, and gives a simpler graph.
             length=batch.valid.sum(dim=1) if batch.rows > 1 else None,
         )
+        if spec.bounded and spec.anchored:
+            rows = replace(rows, low=self.low, high=self.high)
+        if spec.nodes:
+            gap, first, node = self._nodes(at_rows)
+            commit = at_rows.observed.to(dtype)
+            rows = replace(rows, gap=gap, first_node=first, node=node, commit=commit)
         delta = (at_rows.delta / unit).to(dtype) if spec.decay or spec.input_decay else None
         if spec.input_decay:
-            rows = replace(rows, delta=delta, last=at_rows.last, mean=self.mean)
+            rows = replace(rows, delta=delta, last=last, mean=self.mean)
+        kept = at_rows.observed if spec.nodes else torch.ones_like(update)
+        updated = at_last(rows.update, kept, past.updated.to(dtype))
         if spec.decay:
-            updated = torch.cat([past.updated[:, None], update[:, :-1]], dim=1)
-            start, end = at_rows.delta_before, at_rows.delta
-            if not isinstance(self.decay, TrainableDecay):
-                start, end = at_rows.elapsed_before[..., None], at_rows.elapsed[..., None]
-                delta = (end / unit).to(dtype)
+            start, end = self._decay_inputs(at_rows)
             rows = replace(
                 rows,
-                updated=updated.to(dtype),
+                updated=updated,
                 decay_start=(start / unit).to(dtype),
-                decay_end=delta,
+                decay_end=(end / unit).to(dtype),
             )
+        ended = replace(ended, updated=torch.where(kept, rows.update, updated)[:, -1] > 0)
         if ended_actions is not None:
             ended = replace(ended, actions=ended_actions)
         return rows, ended
+
+    def _nodes(self, at_rows: ElapsedTimes) -> tuple[Tensor, Tensor, Tensor]:
+        """`gap`, `first_node` and `node` of `StepInputs`."""
+        spec, step = self.spec, self.time_unit * float(self.spec.max_step or 1)
+        if spec.max_step is None:  # the whole time since the last observed row in one piece
+            first = node = torch.zeros_like(at_rows.elapsed)
+            gap = at_rows.elapsed / self.time_unit
+        else:
+            first, _ = nodes_before(at_rows.elapsed_before / step)
+            node, rest = nodes_before(at_rows.elapsed / step)
+            gap = rest * spec.max_step
+        return gap.to(self.dtype), first.to(self.dtype), node.to(self.dtype)
+
+    def _decay_inputs(self, at_rows: ElapsedTimes) -> tuple[Tensor, Tensor]:
+        """(batch, rows, decay) times, s, that the decay of h starts and ends at."""
+        whole = isinstance(self.decay, TrainableDecay)
+        if self.spec.nodes:
+            start = at_rows.delta_observed
+            start = start if whole else torch.zeros_like(at_rows.elapsed)[..., None]
+            return start, start + self.elapsed_limit
+        if whole:
+            return at_rows.delta_before, at_rows.delta
+        return at_rows.elapsed_before[..., None], at_rows.elapsed[..., None]
 
     def _with_actions(self, batch: Batch, past: RecurrentState) -> tuple[Batch, Tensor]:
         """The batch with each action moved to the row after it, and the actions of the last row."""
@@ -354,6 +428,8 @@ def _spec(
     channels: int,
     decay: TrainableDecay | ExponentialDecay | None,
     cell: type[Cell],
+    *,
+    longest: float,
 ) -> ScanSpec:
     hidden = int(config.hidden_size or 1)
     driven = hidden + (channels if config.anchored else 0)
@@ -361,7 +437,18 @@ def _spec(
     if decay_rows == "every_row" and not isinstance(decay, TrainableDecay):
         decay_rows = "continuous"  # for elapsed time both are the same
     kind = config.vector_field or "none"
-    tableau(config.solver or "euler")  # raises an error for an unknown one
+    adaptive = tableau(config.solver or "euler").adaptive  # raises an error for an unknown one
+    nodes = config.nodes == "observations" and (kind != "none" or decay is not None)
+    max_step = config.max_step
+    if nodes:
+        default = float(config.typical_gap or 1) / (config.steps_per_gap or 1)
+        max_step = (max_step or default) if kind != "none" and not adaptive else None
+        if max_step is not None and max_step * MOST_NODES < float(config.typical_gap or 1):
+            raise InputError(
+                f"max_step={max_step:.3g} reaches {max_step * MOST_NODES:.3g} with its "
+                f"{MOST_NODES} nodes, less than the typical gap of {config.typical_gap:g}; use a "
+                "longer max_step"
+            )
     units = tuple(config.field_units or ()) if kind == "mlp" else ()
     return ScanSpec(
         channels=channels,
@@ -378,8 +465,11 @@ def _spec(
         field_kind="mlp" if kind == "none" else kind,
         activation=config.activation or "tanh",
         solver=config.solver or "euler",
-        steps_per_gap=config.steps_per_gap or 1,
-        max_step=config.max_step,
+        steps_per_gap=1 if nodes else config.steps_per_gap or 1,
+        max_step=max_step,
+        nodes=nodes,
+        decay_span=longest if nodes else 1.0,
+        bounded=bool(config.bounded) and kind != "none",
         rtol=config.rtol or 1e-4,
         atol=config.atol or 1e-6,
         adjoint=config.gradient == "adjoint",
@@ -410,6 +500,20 @@ def _decay(
     return ExponentialDecay(hidden, scalar=config.decay == "scalar")
 
 
+def depends_on_rows(config: ModelConfig) -> bool:
+    """Whether predictions depend on all rows by an option, observed or not.
+
+    Args:
+        config: with these fields set.
+    """
+    return bool(
+        config.update_rows == "every"
+        or config.readout == "last_row"
+        or config.decay_rows != "continuous"
+        or config.self_feeding
+    )
+
+
 def _check(config: ModelConfig) -> None:
     open_fields = [
         f.name for f in fields(config) if f.name != "max_step" and getattr(config, f.name) is None
@@ -418,6 +522,13 @@ def _check(config: ModelConfig) -> None:
         raise InputError(
             f"model options not set: {', '.join(open_fields)}; offbeat.make_model fills them in"
         )
+    if config.nodes == "observations" and depends_on_rows(config):
+        raise InputError(
+            "nodes='observations' needs update_rows='observed', readout='target', "
+            "decay_rows='continuous' and no self_feeding; use nodes='rows', or leave nodes out"
+        )
+    if config.nodes == "observations" and config.max_step and config.steps_per_gap != 1:
+        raise InputError("give max_step or steps_per_gap, not both, with nodes='observations'")
     if config.cell == "none" and config.vector_field == "none":
         raise InputError("a model needs a cell or a vector field; got neither")
     if config.cell == "none" and (config.anchored or config.input_decay or config.self_feeding):

@@ -26,6 +26,8 @@ class Statistics:
         longest_elapsed: s, longest time since the last observed row.
         longest_delta: s, longest time since observation of any channel (equation 25).
         rows: of the longest training trajectory; 0 in checkpoints of 0.1.
+        low: per channel, smallest observed value; empty in checkpoints up to 0.2.
+        high: per channel, largest observed value.
     """
 
     mean: tuple[float, ...]
@@ -34,6 +36,8 @@ class Statistics:
     longest_elapsed: float
     longest_delta: float
     rows: int = 0
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
 
     @property
     def channels(self) -> int:
@@ -85,6 +89,8 @@ class Statistics:
             max(longest[0], float(gaps.median())),
             max(*longest, float(gaps.median())),
             batch.rows,
+            tuple(torch.where(mask, values, torch.inf).amin(dim=(0, 1)).tolist()),
+            tuple(torch.where(mask, values, -torch.inf).amax(dim=(0, 1)).tolist()),
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError, one_of
 from offbeat.models.base import BaseModel, DataInfo
 from offbeat.models.foreign import ForeignModel
-from offbeat.models.model import Model
+from offbeat.models.model import Model, depends_on_rows
 from offbeat.models.statistics import Statistics
 from offbeat.registry import Registry
 
@@ -35,6 +35,7 @@ _COMMON: dict[str, Any] = {
     "field_units": (100, 100, 100, 100),
     "activation": "tanh",
     "solver": "euler",
+    "nodes": "observations",
     "steps_per_gap": 1,
     "rtol": 1e-4,
     "atol": 1e-6,
@@ -52,6 +53,7 @@ _COMMON: dict[str, Any] = {
     "typical_gap": 0.01,
     "clock": "first_observation",
     "gap_limit": 4.0,
+    "bounded": False,
 }
 """Sizes and initial weights of the thesis (chapter 3, after Rubanova et al. 2019)."""
 
@@ -188,7 +190,7 @@ def register_model(
 
 
 def resolve(config: ModelConfig) -> ModelConfig:
-    """Replaces None in a config by the choice of its zoo entry.
+    """Replaces None in a config by the choice of its zoo entry, and what follows from it.
 
     Raises:
         InputError: the zoo has no such entry.
@@ -199,6 +201,11 @@ def resolve(config: ModelConfig) -> ModelConfig:
         for f in fields(config)
         if getattr(config, f.name) is None and f.name in chosen
     }
+    whole = replace(config, **still_open)
+    if config.nodes is None and depends_on_rows(whole):
+        still_open["nodes"] = "rows"
+    if config.bounded is None and "bounded" not in MODELS[config.name].options:
+        still_open["bounded"] = whole.vector_field != "none"
     return replace(config, **still_open)
 
 
@@ -206,7 +213,8 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
     """The configuration of a model in the thesis' protocol.
 
     Predictions are decoded from the last row, the clock starts at the first row, gamma_h compounds
-    at every row of the grid, a plain GRU is given the gap since the row before, and self-feeding,
+    at every row of the grid, the solver takes its steps from row to row and is not bounded, a plain
+    GRU is given the gap since the row before, and self-feeding,
     where it is on, does not decay h at masked rows.
 
     Args:
@@ -216,6 +224,8 @@ def thesis_config(name: str, **options: Any) -> ModelConfig:
     one_of("thesis model", name, THESIS_MODELS)
     feeding = bool(options.get("self_feeding"))
     protocol: dict[str, Any] = {
+        "nodes": "rows",
+        "bounded": False,
         "readout": "last_row",
         "clock": "first_row",
         "decay_rows": "observed_rows" if feeding else "every_row",

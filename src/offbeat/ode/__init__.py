@@ -29,7 +29,6 @@ def solve(
     tableau: Tableau,
     *,
     steps: int | Tensor = 1,
-    most_steps: int | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
     adjoint_parameters: Sequence[Tensor] | None = None,
@@ -44,7 +43,6 @@ def solve(
         duration: (batch, 1) gap of each row in model time; a row of duration 0 keeps its state.
         tableau: the method; an adaptive one steps within the tolerance, any other in equal steps.
         steps: equal steps of every row, or (batch, 1) integers; unused by adaptive methods.
-        most_steps: a constant bound on `steps`, for tracing.
         rtol: tolerance relative to the state; used by adaptive methods only.
         atol: tolerance in the units of the state; used by adaptive methods only.
         adjoint_parameters: if given, gradients come from the adjoint method (`solve_adjoint`), and
@@ -61,12 +59,12 @@ def solve(
     if adjoint_parameters is None:
         if tableau.adaptive:
             return solve_adaptive(field, y, duration, tableau, rtol=rtol, atol=atol)
-        return solve_fixed(field, y, duration, tableau, steps, most_steps)
+        return solve_fixed(field, y, duration, tableau, steps)
     check_problem(y, duration)
 
     def take_steps(field: Field, y: Tensor, duration: Tensor, *, reuse: bool = True) -> Steps:
         if tableau.adaptive:
             return adaptive_steps(field, y, duration, tableau, rtol=rtol, atol=atol, reuse=reuse)
-        return fixed_steps(field, y, duration, tableau, steps, most_steps, reuse=reuse)
+        return fixed_steps(field, y, duration, tableau, steps, reuse=reuse)
 
     return solve_adjoint(field, y, duration, take_steps, tableau.b, adjoint_parameters)

@@ -27,7 +27,6 @@ def solve_fixed(
     duration: Tensor,
     tableau: Tableau,
     steps: int | Tensor = 1,
-    most_steps: int | None = None,
 ) -> Tensor:
     """Integrates dy/ds = duration * field(s, y) from s = 0 to 1 in equal steps.
 
@@ -39,7 +38,6 @@ def solve_fixed(
         duration: (batch, 1) gap of each row in model time; a row of duration 0 keeps its state.
         tableau: the method; the embedded result of an adaptive one is not used.
         steps: number of steps of every row, or (batch, 1) integers, one for each row.
-        most_steps: a constant bound on `steps`, for tracing.
 
     Returns:
         (batch, size) states at the end of the gaps.
@@ -48,11 +46,11 @@ def solve_fixed(
         InputError: shapes or types disagree, or there is less than one step.
     """
     check_problem(y, duration)
-    steps = steps if most_steps else _shared(steps, duration)
+    steps = _shared(steps, duration)
     if tableau.stages == 1 and isinstance(steps, int) and steps == 1:
         # The common case in training, which must cost no more than the field.
         return torch.addcmul(y, duration, field(torch.zeros_like(duration), y))
-    for state, _ in fixed_steps(field, y, duration, tableau, steps, most_steps):
+    for state, _ in fixed_steps(field, y, duration, tableau, steps):
         y = state
     return y
 
@@ -63,7 +61,6 @@ def fixed_steps(
     duration: Tensor,
     tableau: Tableau,
     steps: int | Tensor,
-    most_steps: int | None = None,
     *,
     reuse: bool = True,
 ) -> Steps:
@@ -75,11 +72,10 @@ def fixed_steps(
         duration: (batch, 1) gap of each row.
         tableau: the method.
         steps: number of steps, or (batch, 1) of them.
-        most_steps: see `solve_fixed`.
         reuse: start a step with the last slope of the previous step, if the method allows it.
     """
     slopes: list[Tensor] = []
-    for s, h, moving in _grid(duration, steps, most_steps):
+    for s, h, moving in _grid(duration, steps):
         known = slopes[-1] if slopes and reuse and tableau.first_same_as_last else None
         stepped, slopes = runge_kutta_step(field, s, h, y, duration, tableau, known)
         y = stepped if moving is None else torch.where(moving, stepped, y)
@@ -149,11 +145,9 @@ def check_problem(y: Tensor, duration: Tensor) -> None:
         )
 
 
-def _grid(
-    duration: Tensor, steps: int | Tensor, most_steps: int | None
-) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
+def _grid(duration: Tensor, steps: int | Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor | None]]:
     """Yields (batch, 1) start and length of each step, and which rows move (None: all)."""
-    steps = steps if most_steps else _shared(steps, duration)
+    steps = _shared(steps, duration)
     s = torch.zeros_like(duration)
     # Lengths are differences of the ends, so that s + h is exactly the end.
     if isinstance(steps, int):
@@ -163,7 +157,7 @@ def _grid(
             s = end
         return
     counts = steps.to(duration)
-    for i in range(most_steps or int(steps.max())):
+    for i in range(int(steps.max())):
         end = counts.clamp(max=i + 1) / counts
         yield s, end - s, end > s
         s = end

@@ -98,11 +98,14 @@ class TorchEngine(Engine):
         if past.generator is not None:  # it acts after the prediction
             past = replace(past, generator=torch.Generator())
         with torch.inference_mode():
-            predicted: Tensor = self._model(asked.to(self._model.device), past=past).mean[:, 0]
+            output = self._model(asked.to(self._model.device), past=past)
+            predicted: Tensor = output.mean[:, 0]
             if self._model.acts:  # an action is read after the observation of its own row
                 now = (torch.tensor(times) == self._past.time.cpu())[:, None]
                 acts = torch.tensor([role == ACTION for role in self._model.roles])
-                acting = self._model.head.decode(self._past.state).mean
+                kept = (self._past.observed_at == self._past.time) | (not self._model.spec.nodes)
+                state = torch.where(kept[:, None], self._past.state, output.before[:, 0])
+                acting = self._model.head.decode(state).mean
                 predicted = torch.where((now & acts).to(predicted.device), acting, predicted)
             return predicted.double().cpu().numpy()
 
