@@ -71,7 +71,7 @@ def one_of(what: str, got: str, choices: Iterable[str]) -> str:
         InputError: it is not; the message lists the choices and the nearest one.
     """
     known = sorted(choices)
-    if got in known:
+    if isinstance(got, str) and got in known:
         return got
     near = difflib.get_close_matches(str(got), known[:_MOST_COMPARED], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Sequence
 
+from offbeat.errors import printable
+
 Row = Sequence[str]
 
 MINUS, DASH, TIMES = "\N{MINUS SIGN}", "\N{EN DASH}", "\N{MULTIPLICATION SIGN}"
@@ -42,8 +44,13 @@ def markdown(head: Row, rows: Iterable[Row], *, right: bool = False) -> str:
 
 
 def _piped(text: str) -> str:
-    escaped = text.replace("|", "\\|")
-    return f" {escaped} |" if text else " |"
+    return f" {escape_markdown(text)} |" if text else " |"
+
+
+def escape_markdown(text: str) -> str:
+    """Plain text for a line of Markdown: no tags, links, tables or control characters."""
+    text = printable(text).replace("\n", " ").replace("|", "\\|")
+    return re.sub(r"<(?=[A-Za-z/!?])", "&lt;", text).replace("](", "]\\(")
 
 
 def latex(

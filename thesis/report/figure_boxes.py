@@ -57,7 +57,7 @@ def boxes_figure(record: Record, fraction: float) -> Figure:
             if scoring == "honest":  # the models differ by more than a factor here
                 axes.set_xscale("log")
                 plain_ticks(axes.xaxis, axes.get_xlim(), times=1e3)
-            axes.set_xlabel("Test MSE (scaled units, 10$^{-3}$)")
+            axes.set_xlabel("Test MSE (scaled units, 10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT THREE})")
         _thesis_intervals(both[0], fraction, thesis.MODELS)
     return figure
 

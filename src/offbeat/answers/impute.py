@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -27,6 +26,7 @@ from offbeat.answers.two_sided import (
 )
 from offbeat.config import TrainConfig
 from offbeat.data.rows import add_rows, times_at_rate
+from offbeat.data.source import read_json
 from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, one_of
@@ -287,11 +287,11 @@ def load_two_sided(path: str | Path) -> TwoSided:
             f"{path} has no {RULE_FILE}: it is not a two-sided run; train with --two_sided true"
         )
     try:
-        rule = FillRule.from_dict(json.loads((path / RULE_FILE).read_text(encoding="utf-8")))
+        rule = FillRule.from_dict(read_json(path / RULE_FILE))
         return TwoSided(load_model(path), load_model(path / "backward"), rule)
     except FileFormatError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise FileFormatError(
             f"{path / RULE_FILE} is damaged ({error}); the same training writes it again"
         ) from None

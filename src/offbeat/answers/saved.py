@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as dump_arrays
 
 from offbeat.answers.blend import Blend, tables_of
+from offbeat.data.source import read_json
 from offbeat.data.tasks import TaskConfig
 from offbeat.data.transforms import Transforms
-from offbeat.errors import FileFormatError, InputError
+from offbeat.errors import FileFormatError
 from offbeat.files import atomic_path, write_json
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_model, save_model
@@ -76,7 +78,7 @@ def load_blend(path: str | Path) -> Blend:
             "with offbeat.fit_blend"
         )
     try:
-        record = json.loads((path / CONFIG).read_text(encoding="utf-8"))
+        record = read_json(path / CONFIG)
         if record["format"] != FORMAT:
             raise FileFormatError(f"{path / CONFIG} is not of the format {FORMAT}")
         if record["version"] != VERSION:
@@ -109,7 +111,8 @@ def load_blend(path: str | Path) -> Blend:
         raise
     except OSError as error:
         raise FileFormatError(f"{path} holds no whole blend: {error}") from None
-    except (KeyError, TypeError, ValueError, InputError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError,
+            SafetensorError) as error:  # fmt: skip
         raise FileFormatError(
             f"{path / CONFIG} is damaged ({type(error).__name__}: {error}); the same training "
             "writes it again"

@@ -148,6 +148,8 @@ class CommandParser(ArgumentParser):
 
     def _read(self, path: Path, before: Namespace | None) -> Namespace:
         try:
+            if path.exists() and not path.is_file():
+                raise OSError("it is no file")
             with path.open(encoding="utf-8") as file:
                 values = _load(file.read(safe_yaml.MOST_CHARACTERS + 1))
         except (OSError, UnicodeError, yaml.YAMLError) as error:

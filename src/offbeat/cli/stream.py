@@ -41,7 +41,8 @@ def stream_command(
     import sys
     import time
 
-    from offbeat.errors import FileFormatError
+    from offbeat.data.source import read_json
+    from offbeat.errors import FileFormatError, InputError
     from offbeat.files import writable, write_json
     from offbeat.stream.latency import Latency
     from offbeat.stream.lines import LineSession
@@ -66,8 +67,8 @@ def stream_command(
         stream = Stream(load_predictor(model), options, time_unit=time_unit, seed=seed)
     if state is not None and state.exists():
         try:
-            stream.restore(json.loads(state.read_text(encoding="utf-8")))
-        except ValueError as error:
+            stream.restore(read_json(state))
+        except InputError as error:
             raise FileFormatError(f"{state} can't be restored: {error}") from None
     session, latency = LineSession(stream, horizon_s=horizon_s), Latency()
 
@@ -77,6 +78,10 @@ def stream_command(
         latency.add(time.perf_counter_ns() - began)
         return reply
 
+    if sys.stdin is None or sys.stdout is None:
+        raise InputError(
+            "standard input and standard output must be open; a stream reads and answers"
+        )
     sys.stdout.flush()
     complete = serve(answer, session.refuse, source=sys.stdin.fileno(), sink=sys.stdout.fileno())
     if not complete:

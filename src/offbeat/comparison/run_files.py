@@ -233,8 +233,8 @@ def read_rows(path: Path, text: Iterable[str]) -> list[dict[str, Any]]:
             )
             table = pyarrow.csv.read_csv(path, convert_options=options)
         rows: list[dict[str, Any]] = table.to_pylist()
-    except (pa.ArrowException, OSError) as error:
-        line = " ".join(str(error).split())
+    except (pa.ArrowException, OSError, ValueError) as error:
+        line = " ".join(str(error).split())[:200]
         raise FileFormatError(f"{path} cannot be read as a table of runs: {line}") from None
     return rows
 

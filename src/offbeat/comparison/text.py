@@ -49,7 +49,7 @@ def markdown(comparison: Comparison) -> str:
     """Tables in Markdown."""
     parts = [_heading(comparison)]
     for condition in comparison.conditions:
-        parts.append(f"## {condition.condition}")
+        parts.append(f"## {tables.escape_markdown(condition.condition)}")
         parts += [
             f"{grid.title}\n\n{tables.markdown(grid.head, grid.rows, right=True)}"
             for grid in grids(comparison, condition)

@@ -17,6 +17,10 @@ PICKLE_SUFFIXES = (".pkl", ".pickle", ".p", ".pt", ".pth", ".joblib", ".dill")
 _PICKLE_STARTS = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 
 
+class NotRegularError(Exception):
+    """A path is neither a file nor a folder."""
+
+
 def starts_with(path: Path, starts: bytes | tuple[bytes, ...]) -> bool:
     """Whether a file starts with certain bytes; False if it cannot be read."""
     try:
@@ -41,11 +45,13 @@ def require_file(path: str | Path) -> Path:
         raise FileFormatError(f"{path} is a folder, expected a file; name the file inside it")
     try:
         if not stat.S_ISREG(path.stat().st_mode):
-            raise FileFormatError(
-                f"{path} is a pipe or a device, expected a file; write what it gives to a file"
-            )
+            raise NotRegularError
         with path.open("rb") as file:
             start = file.read(64)
+    except NotRegularError:
+        raise FileFormatError(
+            f"{path} is a pipe or a device, expected a file; write what it gives to a file"
+        ) from None
     except (OSError, ValueError) as error:  # such as a byte of 0 in the path
         why = error.strerror if isinstance(error, OSError) else error
         raise FileFormatError(

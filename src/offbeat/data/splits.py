@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from offbeat.config import SplitConfig, from_mapping
 from offbeat.data.masking import mask_out
+from offbeat.data.source import read_json
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.data.windows import Cut, owned_windows
 from offbeat.errors import FileFormatError, InputError
@@ -283,13 +283,13 @@ def load_split(path: str | Path, dataset: Dataset) -> tuple[Dataset, Dataset, Da
     if not path.is_file():
         return None
     try:
-        kept = json.loads(path.read_text(encoding="utf-8"))
+        kept = read_json(path)
         old = "hide" in kept
         if kept.pop("data") != dataset.fingerprint(version=1 if old else 2):
             return None
         return apply_split(dataset, from_mapping(SplitConfig, _renamed(kept) if old else kept))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path} is damaged ({error}); train again") from None
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path} is damaged ({str(error)[:150]}); train again") from None
 
 
 def _renamed(kept: Mapping[str, Any]) -> dict[str, Any]:

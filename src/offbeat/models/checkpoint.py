@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as dump_tensors
 from torch import Tensor
 
 from offbeat.data.scaler import Scaler
+from offbeat.data.source import read_json, require_file
 from offbeat.data.trajectory import STATE
 from offbeat.data.transforms import Transforms
 from offbeat.errors import FileFormatError, InputError
@@ -52,8 +56,8 @@ def load_model(path: str | Path) -> Any:
         A `Model`, a `CorrectedModel`, or a `ForeignModel`.
 
     Raises:
-        FileFormatError: the folder is missing, damaged, not a checkpoint,
-            or of a newer version.
+        FileFormatError: the folder is missing, damaged, not a checkpoint, of a newer version, or
+            its weights are not finite.
         InputError: it is a model of another package, which has not been registered.
     """
     path = Path(path)
@@ -65,15 +69,38 @@ def load_model(path: str | Path) -> Any:
             f"{path} holds the model {record['name']!r} of another package, which is not "
             "registered here; import that package, or call offbeat.register_model, before loading"
         )
+    weights = {k: v for k, v in tensors.items() if not k.startswith("training.")}
     try:
+        _check_sizes(record["model"], weights)
         model = _build(record)
         if record["dtype"] == "float64":
             model.double()
-        weights = {k: v for k, v in tensors.items() if not k.startswith("training.")}
         model.load_state_dict(weights)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise FileFormatError(f"{path}: its config and its weights disagree ({error})") from None
+    except _DAMAGE as error:
+        what = " ".join(str(error).split())[:150]
+        raise FileFormatError(
+            f"{path}: its config and its weights disagree ({type(error).__name__}: {what})"
+        ) from None
+    bad = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
+    if bad:
+        raise FileFormatError(
+            f"{path} has weights that are not finite, in {bad[0]}, so that it predicts nothing; "
+            "train it again with a lower learning rate"
+        )
     return model
+
+
+_DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""Errors of building a model from a record that no training wrote."""
 
 
 def save_training_state(
@@ -197,10 +224,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
                 f"{path} is not a checkpoint: it has no {name}; give the folder that was written "
                 "by training, or its subfolder 'model'"
             )
-    try:
-        record = json.loads((path / CONFIG).read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileFormatError(f"{path / CONFIG} is damaged ({error})") from None
+    record = read_json(path / CONFIG)
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise FileFormatError(
             f"{path / CONFIG} is not an Offbeat checkpoint (no format {FORMAT!r})"
@@ -210,16 +234,61 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             f"{path} is of checkpoint version {record.get('version')!r}, this Offbeat reads "
             f"versions 1 to {VERSION}; use the Offbeat that wrote it, or a newer one"
         )
-    if record.pop("config_sha256", None) != _digest(record):
+    try:
+        digest = _digest({key: value for key, value in record.items() if key != "config_sha256"})
+    except (ValueError, RecursionError):  # NaN, which no training writes
+        digest = ""
+    if record.pop("config_sha256", None) != digest:
         raise FileFormatError(f"{path / CONFIG} is damaged: its checksum does not match")
-    data = (path / TENSORS).read_bytes()
-    if hashlib.sha256(data).hexdigest() != record["tensors_sha256"]:
+    data = require_file(path / TENSORS).read_bytes()
+    if hashlib.sha256(data).hexdigest() != record.get("tensors_sha256"):
         raise FileFormatError(f"{path / TENSORS} is damaged: its checksum does not match")
-    tensors = load_tensors(data)
-    if record["version"] == 1:
-        tensors = {_renamed(name): tensor for name, tensor in tensors.items()}
-        record = _of_version_1(record)
+    try:
+        tensors = load_tensors(data)
+        if record["version"] == 1:
+            tensors = {_renamed(name): tensor for name, tensor in tensors.items()}
+            record = _of_version_1(record)
+        for name, kind in _FIELDS.items():
+            if not isinstance(record[name], kind):
+                raise TypeError(f"{name} is a {type(record[name]).__name__}")
+    except (SafetensorError, *_DAMAGE) as error:
+        raise FileFormatError(
+            f"{path} is damaged ({type(error).__name__}: {str(error)[:100]}), although its "
+            "checksum matches; do not trust it"
+        ) from None
     return tensors, record
+
+
+_FIELDS = {
+    "dtype": str,
+    "name": str,
+    "model": dict,
+    "names": list,
+    "units": list,
+    "roles": list,
+    "statistics": dict,
+    "scaler": dict,
+    "transforms": dict,
+}
+"""Fields of a record, and their types."""
+
+
+def _check_sizes(config: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
+    """Checks that a config asks for no more weights than there are, before any is allocated.
+
+    Raises:
+        ValueError: it does.
+    """
+    count = sum(weight.numel() for weight in weights.values())
+    hidden = config.get("hidden_size") or 1
+    sizes = [hidden, *(config.get("field_units") or ()), *(config.get("decoder_units") or ())]
+    cell = config.get("cell") not in (None, "none")
+    largest = max((one * other for one, other in itertools.pairwise(sizes)), default=0)
+    if max(*sizes, 1) > count or largest > 100 * count or (cell and hidden * hidden > count):
+        raise ValueError(f"its config asks for layers of {sizes[:5]} units, it has {count} weights")
+    for inner in config.values():
+        if isinstance(inner, Mapping):
+            _check_sizes(inner, weights)
 
 
 def _digest(record: dict[str, Any]) -> str:

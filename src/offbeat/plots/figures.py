@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 import numpy as np
 
 from offbeat.data.trajectory import Trajectory
-from offbeat.errors import InputError, one_of
+from offbeat.errors import InputError, one_of, printable
 from offbeat.files import atomic_path
 from offbeat.plots.style import RC, STYLES, style_of
 
@@ -223,9 +223,13 @@ def save(figure: Figure, path: str | Path) -> Path:
         InputError: another suffix.
     """
     from matplotlib import rc_context
+    from matplotlib.text import Text
 
     path = Path(path)
     suffix = one_of("suffix of a figure", path.suffix.lower(), _METADATA)
+    for text in figure.findobj(Text):  # names in files may hold any character
+        if not text.get_text().isprintable():
+            text.set_text(printable(text.get_text()))
     with rc_context(RC), atomic_path(path) as temporary:
         figure.savefig(temporary, format=suffix[1:], dpi=200, metadata=_METADATA[suffix])
     return path

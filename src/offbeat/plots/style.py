@@ -99,6 +99,7 @@ RC: dict[Any, Any] = {
     "ytick.labelsize": 8.5,
     "pdf.fonttype": 42,  # text stays text
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names of channels may hold dollar signs
 }
 """Settings of matplotlib, applied only while a figure is made or saved."""
 

@@ -43,7 +43,10 @@ class LineSession:
             return b""
         try:
             text = json.dumps(self._answer(line), allow_nan=False)
-        except (OffbeatError, ValueError, RecursionError) as error:
+        except (
+            *(OffbeatError, ValueError, RecursionError),
+            *(ArithmeticError, AttributeError, LookupError, TypeError),
+        ) as error:
             return self._refusal(str(error) or type(error).__name__)
         return text.encode() + b"\n"
 

@@ -121,7 +121,7 @@ class Placement:
             ]
             counters = StreamCounters.from_dict(record["counters"])
             self.history.restore(record["history"], channels)
-        except (KeyError, TypeError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
             what = f"{type(error).__name__}: {error}"
             raise InputError(f"the record of the stream is damaged ({what})") from None
         self.clock.origin, self.seen = origin, seen

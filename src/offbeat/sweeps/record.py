@@ -226,5 +226,5 @@ def _typed_rows(path: Path, columns: Mapping[str, type]) -> list[dict[str, Any]]
             }
             for row in rows
         ]
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError(f"{path} is damaged: {error!r}") from None
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
+        raise FileFormatError(f"{path} is damaged: {str(error)[:150]!r}") from None

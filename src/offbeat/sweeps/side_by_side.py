@@ -14,7 +14,7 @@ from tqdm import tqdm
 from offbeat.config import TrainConfig
 from offbeat.data.scaler import Scaler
 from offbeat.data.store import load
-from offbeat.errors import OffbeatError
+from offbeat.errors import FileFormatError, OffbeatError
 from offbeat.models.zoo import make_model, recipe_of
 from offbeat.run import EpochRecord
 from offbeat.sweeps.engines import base
@@ -54,16 +54,22 @@ class Job:
         log = self.folder / "log.csv"
         if not log.exists():
             return ()
-        with log.open(newline="", encoding="utf-8") as file:
-            lines = list(csv.DictReader(file))
-        return tuple(
-            EpochRecord(
-                int(line.pop("epoch")),
-                int(line.pop("steps")),
-                **{name: float(value) for name, value in line.items()},
+        try:
+            with log.open(newline="", encoding="utf-8") as file:
+                lines = list(csv.DictReader(file))
+            return tuple(
+                EpochRecord(
+                    int(line.pop("epoch")),
+                    int(line.pop("steps")),
+                    **{name: float(value) for name, value in line.items()},
+                )
+                for line in lines
             )
-            for line in lines
-        )
+        except (KeyError, OverflowError, TypeError, ValueError, csv.Error) as error:
+            raise FileFormatError(
+                f"{log} is damaged ({str(error)[:150]}); remove its folder, and the model is "
+                "trained again"
+            ) from None
 
 
 def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = True) -> None:

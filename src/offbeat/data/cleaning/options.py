@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -141,9 +142,12 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
 
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number, and no boolean."""
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def _numbers(given: Any) -> tuple[float, ...]:
@@ -159,7 +163,7 @@ def _numbers(given: Any) -> tuple[float, ...]:
     for one in listed:
         try:
             found.append(float(one))
-        except (TypeError, ValueError):
+        except (OverflowError, TypeError, ValueError):
             raise InputError(
                 f"missing must be numbers such as -999, got {one!r}; texts are an option of CSV"
             ) from None

@@ -17,6 +17,7 @@ from typing import Any, Literal
 from offbeat.data import store
 from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, ulog
 from offbeat.data.readers.folders import FILES, check_paths, files_in, together
+from offbeat.data.readers.options import check_types
 from offbeat.data.recording import ReaderOptions, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
@@ -208,6 +209,10 @@ def _split(options: dict[str, Any], reader: Reader) -> tuple[dict[str, Any], dic
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
         one_of(f"option of the {reader.name} reader", option, reader.options)
     own = {name: options[name] for name in reader.own_options if name in options}
+    check_types(own, reader.function, f" of the {reader.name} reader")
+    if reader.cleaning:
+        rest = {name: value for name, value in options.items() if name not in own}
+        check_types(rest, ReaderOptions, "")
     # Columns are left out by name, and texts of missing values are replaced, before the cleaning.
     if "missing" in own:
         options["missing"] = [m for m in _several(own["missing"]) if _is_number(m)]
@@ -257,7 +262,7 @@ def _several(given: Any) -> list[Any]:
 def _is_number(given: Any) -> bool:
     try:
         return not isinstance(given, bool) and math.isfinite(float(given))
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         return False
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from offbeat.data.cleaning.options import is_number
 from offbeat.errors import InputError, one_of
 
 
@@ -22,6 +25,53 @@ def names(option: str, given: Iterable[str] | None) -> tuple[str, ...] | None:
     if not listed or not all(isinstance(name, str) for name in listed):
         raise InputError(f"{option} must be one name or more, got {given!r}")
     return tuple(dict.fromkeys(listed))
+
+
+def check_types(options: Mapping[str, Any], described: Any, where: str) -> None:
+    """Checks options against the annotations of a function or of the fields of a class.
+
+    Args:
+        options: by name; those that are not annotated are not checked.
+        described: the function or class.
+        where: for messages.
+
+    Raises:
+        InputError: an option has another type.
+    """
+    try:
+        hints = get_type_hints(described)
+    except (NameError, TypeError):  # of a reader of another package
+        return
+    for name, value in options.items():
+        if name in hints and not fits(value, hints[name]):
+            expected = str(hints[name]).removeprefix("<class '").removesuffix("'>")
+            for start in ("typing.", "collections.abc."):
+                expected = expected.replace(start, "")
+            shown = repr(value) if len(repr(value)) < 60 else type(value).__name__
+            raise InputError(f"{name}{where} must be {expected}, got {shown}")
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a value has an annotated type. A single name counts as a sequence of names."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(fits(value, one) for one in inner)
+    if origin is Literal:
+        return isinstance(value, str)
+    if origin is not None and issubclass(origin, Mapping):
+        return isinstance(value, Mapping) and all(
+            fits(key, inner[0]) and fits(one, inner[1]) for key, one in value.items()
+        )
+    if origin is not None and issubclass(origin, Sequence):
+        if isinstance(value, str):
+            return str in inner
+        listed = isinstance(value, list | tuple | set | frozenset | range)
+        return listed and all(fits(one, inner[0]) for one in value)
+    if hint is float:
+        return is_number(value) or (isinstance(value, float) and not isinstance(value, bool))
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, hint) if isinstance(hint, type) else True
 
 
 class Fields:
