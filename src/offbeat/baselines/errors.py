@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from offbeat.baselines.history import AgeBins
-from offbeat.data.batch import Batch, delta, last_index
+from offbeat.data.batch import Batch
 
 CLIPPED = 0.995
 """Squared errors above this quantile of their cell count as the quantile: outliers in a log."""
@@ -34,9 +35,13 @@ def cells(batch: Batch, bins: AgeBins) -> Tensor:
     Returns:
         (batch, rows, channels) int64; `len(bins)` before the first observation.
     """
-    mask = batch.mask & batch.valid[..., None]
-    found: Tensor = bins.of_age(delta(batch.times, mask))
-    return torch.where(last_index(mask) >= 0, found, len(bins))
+    times = batch.times.cpu().numpy()[..., None]
+    mask = (batch.mask & batch.valid[..., None]).cpu().numpy()
+    latest = np.full(mask.shape, -np.inf)
+    np.maximum.accumulate(np.where(mask, times, -np.inf)[:, :-1], axis=1, out=latest[:, 1:])
+    age = times - latest
+    found = np.searchsorted(bins.edges[:-1], age)  # as `AgeBins.of_age`
+    return torch.from_numpy(np.where(np.isinf(age), len(bins), found)).to(batch.times.device)
 
 
 @dataclass(frozen=True, eq=False)
