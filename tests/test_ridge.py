@@ -10,6 +10,7 @@ import pytest
 import offbeat as ob
 from offbeat.baselines import cross_fitted, fit_baseline, folds_of
 from offbeat.baselines.held_out import Products, held_out_ridge
+from offbeat.baselines.kernel_ridge import gaussians, whitening
 from offbeat.baselines.ridge_fill import backwards
 from offbeat.data.tasks import TaskConfig, draw_tasks, take_tasks
 
@@ -184,6 +185,45 @@ def test_weights_are_zero_where_nothing_can_be_predicted():
     groups = np.repeat(np.arange(4), 10)
     assert not held_out_ridge(x, y, groups, (1e-6, 1e-3)).any()
     assert not held_out_ridge(x, y, np.zeros(40, dtype=int)).any()
+
+
+# --- kernels --------------------------------------------------------------------------------------
+
+
+def test_with_every_point_as_a_centre_it_is_the_kernel_ridge_of_scikit_learn():
+    sklearn = pytest.importorskip("sklearn.kernel_ridge")
+    random = np.random.default_rng(0)
+    x, new = random.standard_normal((60, 2)), random.standard_normal((20, 2))
+    y = np.sin(2 * x[:, :1]) + x[:, 1:] ** 2
+    root = whitening(gaussians(x, x))
+    weights = held_out_ridge(gaussians(x, x) @ root, y, np.repeat(np.arange(4), 15), (1e-3,))
+    model = sklearn.KernelRidge(alpha=1e-3 * 60, kernel=lambda a, b: _mean_of_gaussians(a - b))
+    expected = model.fit(x, y).predict(new)
+    assert gaussians(new, x) @ root @ weights == pytest.approx(expected, abs=2e-3)
+
+
+def _mean_of_gaussians(difference: np.ndarray) -> float:
+    square = (difference**2).mean()
+    return float(np.mean([np.exp(-square / 2 / width**2) for width in (0.5, 1.0, 2.0)]))
+
+
+def test_a_kernel_learns_a_motion_that_bends_with_the_place():
+    # x' = v, v' = 4 (1 - x^2) v - x (van der Pol), from different phases of the cycle.
+    random = np.random.default_rng(0)
+    made = []
+    for _ in range(80):
+        x, v, values = random.uniform(-2, 2), random.uniform(-2, 2), []
+        for i in range(20 * 100):
+            x, v = x + 0.01 * v, v + 0.01 * (4 * (1 - x * x) * v - x)
+            if i >= 1000 and i % 20 == 0:
+                values.append(x)
+        made.append(ob.Trajectory(0.2 * np.arange(50), np.array(values)[:, None]))
+    data = cut(ob.Dataset(tuple(made)), 44)
+    errors = {}
+    for name in ("ridge", "kernel_ridge"):
+        fitted = fit_baseline(name, data[:60])
+        errors[name] = missed(fitted, data[60:])
+    assert errors["kernel_ridge"] < 0.6 * errors["ridge"]
 
 
 # --- folds ----------------------------------------------------------------------------------------

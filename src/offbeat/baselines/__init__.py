@@ -19,6 +19,7 @@ from offbeat.baselines.base import (
 from offbeat.baselines.folds import cross_fitted, folds_of
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.kalman_channels import KalmanLong, KalmanShort, Smoother
+from offbeat.baselines.kernel_ridge import KernelRidge
 from offbeat.baselines.ridge import Ridge
 from offbeat.baselines.ridge_fill import RidgeFill
 from offbeat.baselines.simple import (
@@ -42,6 +43,7 @@ __all__ = [
     "History",
     "KalmanLong",
     "KalmanShort",
+    "KernelRidge",
     "LastValue",
     "Linear",
     "Mean",
