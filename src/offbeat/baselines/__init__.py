@@ -17,8 +17,10 @@ from offbeat.baselines.base import (
     fit_baseline,
 )
 from offbeat.baselines.folds import cross_fitted, folds_of
+from offbeat.baselines.groups import Group, find_groups
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.kalman_channels import KalmanLong, KalmanShort, Smoother
+from offbeat.baselines.kalman_groups import MotionFilter, MotionSmoother
 from offbeat.baselines.kernel_ridge import KernelRidge
 from offbeat.baselines.ridge import Ridge
 from offbeat.baselines.ridge_fill import RidgeFill
@@ -40,6 +42,7 @@ __all__ = [
     "CausalBaseline",
     "ConstantVelocity",
     "DampedSlope",
+    "Group",
     "History",
     "KalmanLong",
     "KalmanShort",
@@ -47,6 +50,8 @@ __all__ = [
     "LastValue",
     "Linear",
     "Mean",
+    "MotionFilter",
+    "MotionSmoother",
     "Pchip",
     "Ridge",
     "RidgeFill",
@@ -56,6 +61,7 @@ __all__ = [
     "cross_fitted",
     "fill",
     "fillers",
+    "find_groups",
     "fit_baseline",
     "folds_of",
     "forecast",

@@ -15,7 +15,7 @@ matrices.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -227,6 +227,20 @@ class Chains:
         fields: dict[str, Any] = {
             n: np.asarray(arrays[prefix + n]) for n in cls.__dataclass_fields__
         }
+        return cls(**fields)
+
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[Chains, int]]) -> Chains:
+        """Single chains of one order as one.
+
+        Args:
+            parts: chains, and the number of one of them.
+        """
+        fields: dict[str, Any] = {}
+        for name in cls.__dataclass_fields__:
+            axis = 0 if name in ("channels", "unit") else -1
+            each = [getattr(chains, name).take([i], axis) for chains, i in parts]
+            fields[name] = np.concatenate(each, axis)
         return cls(**fields)
 
     # --- filter -----------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ STEPS = 12
 SEGMENT = 96
 """Most rows that are stepped through from one start."""
 
-CELLS = 250_000
+CELLS = 120_000
 """Most rows of all chains together that a search steps through."""
 
 FEW = 20
@@ -75,7 +75,7 @@ class Sample:
             cells: most rows of all chains together.
         """
         chains, order = channels.shape
-        most = int(np.clip(cells // (SEGMENT * chains), 16, 512))
+        most = int(np.clip(cells // (SEGMENT * chains), 16, 256))
         drawn = [_segments(tasks, row[row >= 0], most) for row in channels]
         count = max(len(d) for d in drawn)
         rows = max(len(at) for d in drawn for _, at in d)
