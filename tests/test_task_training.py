@@ -177,14 +177,28 @@ def test_a_training_on_tasks_that_was_killed_ends_as_if_it_had_not_been(name, tm
         assert np.array_equal(a.values, b.values)
 
 
-def test_a_model_keeps_moving_through_the_longest_silence_of_its_tasks():
+@pytest.mark.parametrize("name", ["anchored_ode_gru_d", "gru_d", "ode_gru_d", "gru"])
+def test_a_model_keeps_moving_through_the_longest_silence_of_its_tasks(name, tmp_path):
     """Its clock saturates at a multiple of the longest silence that it knows of."""
     whole = ob.Dataset(tuple(replace(t, observed=None) for t in TRAIN))
-    model = ob.make_model("anchored_ode_gru_d", whole, **SMALL)
+    model = ob.make_model(name, whole, **SMALL)
     assert model.statistics.longest_elapsed == pytest.approx(0.05)
     config = ob.TrainConfig(tasks=replace(TASKS, horizon_s=1.0), epochs=1, tasks_per_epoch=8)
-    ob.fit(model, whole, config=config, progress=False)
+    ob.fit(model, whole, config=config, out=tmp_path, progress=False)
     assert model.statistics.longest_elapsed == 1.0
+    loaded = ob.load_model(tmp_path)
+    cut = draw_tasks(whole, TaskConfig(horizon_s=1.0, gap_s=0.05), 5, shares={"cut": 1.0})
+    with torch.no_grad():
+        for one in (model, loaded):
+            for k, parameter in enumerate(one.parameters()):
+                generator = torch.Generator().manual_seed(k)
+                parameter.normal_(0, 0.3, generator=generator)
+    assert loaded.spec == model.spec
+    for a, b, t in zip(ob.predict(model, cut), ob.predict(loaded, cut), cut, strict=True):
+        assert np.array_equal(a.values, b.values)
+        silent = t.times - t.times[t.observed.any(axis=1)][-1]
+        if silent[-1] > 0.5:  # four times the gap of the data would be 0.2 s
+            assert not np.allclose(a.values[-1], a.values[np.argmax(silent > 0.3)])
 
 
 def test_without_options_tasks_bring_a_recipe_with_a_relative_loss():

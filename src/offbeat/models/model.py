@@ -87,7 +87,6 @@ class Model(BaseModel):
         self.decay = _decay(config, channels, hidden)
         self.input_decay = InputDecay(channels) if config.input_decay else None
         kind = CELLS["start" if config.cell == "none" else config.cell or "gru"]
-        self.elapsed_limit = statistics.longest_elapsed * float(config.gap_limit or 1)
         self.spec = _spec(
             config, channels, self.decay, kind, longest=self.elapsed_limit / self.time_unit
         )
@@ -160,6 +159,17 @@ class Model(BaseModel):
     def dtype(self) -> torch.dtype:
         """Dtype of the weights."""
         return self.cell.bias.dtype
+
+    @property
+    def elapsed_limit(self) -> float:
+        """s, at which the time since the last observed row saturates."""
+        return self.statistics.longest_elapsed * float(self.config.gap_limit or 1)
+
+    def expect_silences(self, seconds: float) -> None:
+        """See `BaseModel`."""
+        super().expect_silences(seconds)
+        if self.spec.nodes:
+            self.spec = replace(self.spec, decay_span=self.elapsed_limit / self.time_unit)
 
     @property
     def time_input_unit(self) -> float:
