@@ -342,3 +342,15 @@ def test_a_flipped_bit_anywhere_is_noticed_or_changes_nothing(path):
         else:
             assert_identical(dataset, example())
     assert noticed > len(content) / 6
+
+
+def test_a_tensor_file_whose_header_is_as_long_as_a_pickle_starts_is_not_taken_for_one(tmp_path):
+    from safetensors.numpy import save as dump
+
+    from offbeat.data.source import require_file
+
+    path = tmp_path / "model.safetensors"
+    every = (dump({"a": np.zeros(1)}, {"note": "x" * n}) for n in range(1000))
+    data = next(data for data in every if data[:2] == bytes([0x80, 2]))
+    path.write_bytes(data)
+    assert require_file(path) == path

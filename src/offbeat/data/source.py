@@ -63,7 +63,11 @@ def require_file(path: str | Path) -> Path:
         raise FileFormatError(
             f"{path} is a Git LFS pointer, not the data; fetch the data with: git lfs pull"
         )
-    if start.startswith(_PICKLE_STARTS) or path.suffix.lower() in PICKLE_SUFFIXES:
+    # A tensor file starts with the length of its header, which can be the bytes of a pickle.
+    tensors = path.suffix.lower() == ".safetensors"
+    if (start.startswith(_PICKLE_STARTS) and not tensors) or (
+        path.suffix.lower() in PICKLE_SUFFIXES
+    ):
         raise FileFormatError(
             f"{path} holds pickled Python objects, which can run any code when they are loaded; "
             "Offbeat never does; write the data as Parquet, CSV or NPZ"
