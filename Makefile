@@ -37,6 +37,12 @@ check: .venv/.test ## install, then lint, check the format and the types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+MUTANTS ?= 1000
+
+.PHONY: fuzz
+fuzz: .venv/.test ## read MUTANTS damaged files of every format
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py --mutants $(MUTANTS)
+
 # The kernel's tests with the address and undefined-behaviour sanitizers, in a build of its own.
 SANITIZED := build/sanitized
 RUNTIME = $(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)

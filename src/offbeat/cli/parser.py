@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import inspect
+import itertools
 import re
 from argparse import ArgumentError
 from collections.abc import Callable, Mapping, Sequence
@@ -136,6 +137,7 @@ class CommandParser(ArgumentParser):
                 safe_yaml.check_value([text.partition("=")[2] or text for text in args])
             except yaml.YAMLError as error:
                 raise ArgumentError(None, f"a value can't be read: {error}") from None
+            self._refuse_pipes(args)
             first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
             first.add_argument("--config", action="append", default=[])
             configs = first.parse_known_args(args)[0].config
@@ -145,6 +147,21 @@ class CommandParser(ArgumentParser):
             return super().parse_args(args, namespace, **options)
         except ValueError as error:  # a value that names something to import
             raise ArgumentError(None, str(error)) from None
+
+    def _refuse_pipes(self, args: Sequence[str]) -> None:
+        """Raises an error for a group of options whose file would never end."""
+        groups = {f"--{name.lstrip('-').partition('.')[0]}" for name in self._option_string_actions
+                  if "." in name}  # fmt: skip
+        for text, following in itertools.zip_longest(args, args[1:], fillvalue=""):
+            name, equals, value = text.partition("=")
+            path = Path(value if equals else following)
+            try:
+                if name in groups and path.exists() and not path.is_file():
+                    raise ArgumentError(
+                        None, f"{name} {path} is no file, expected one with options"
+                    )
+            except (OSError, ValueError):
+                continue  # a value that is no path
 
     def _read(self, path: Path, before: Namespace | None) -> Namespace:
         try:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.inspection import Inspection
 from offbeat.data.trajectory import SECONDS_PER, Dataset
+from offbeat.errors import printable
 from offbeat.plots.style import RC
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ def _label(lane: _Lane, dataset: Dataset) -> str:
 
 
 def _short(name: str, most: int = 30) -> str:
+    name = printable(name)
     return name if len(name) <= most else f"\N{HORIZONTAL ELLIPSIS}{name[-most + 1 :]}"
 
 

@@ -495,8 +495,8 @@ class _CsvFile:
             expected = "a number; if its comma is a decimal point, say so with decimal=','"
         else:
             expected = (
-                f"a number; if it means a missing value, say so with missing=[{got.strip()}], or "
-                "leave the column out with without="
+                "a number; if it means a missing value, name it with missing=, or leave the column "
+                "out with without="
             )
         return FileFormatError(
             f"{self.path} has {got[:60]!r} in line {line}, column {name!r}, expected {expected}"
