@@ -15,6 +15,7 @@ constexpr int MAX_GROUP = 128;
 constexpr int64_t MAX_UNITS = 1 << 20;     // of a layer, of the channels, of the hidden state
 constexpr int64_t MAX_STEPS = 1'000'000;   // of the solver over one gap
 constexpr int MOST_NODES = 2048;           // after an observed row: kernels/spec.py
+constexpr int TRACKED_NODES = 256;         // steps before a row with a gradient: kernels/spec.py
 constexpr int64_t MAX_COUNT = 2147483647;  // trajectories, rows
 
 enum Cell { CELL_NONE, CELL_START, CELL_ELMAN, CELL_LSTM, CELL_GRU };

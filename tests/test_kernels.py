@@ -19,7 +19,7 @@ from scan_problems import CELLS, FLOWS, Problem, largest_error, problem, run
 
 import offbeat as ob
 from offbeat import kernels
-from offbeat.kernels import StepInputs, StepTable, cpu, reference
+from offbeat.kernels import StepInputs, StepTable, cpu, reference, spec
 from offbeat.models.zoo import ZOO
 
 needs_cpu = pytest.mark.skipif(
@@ -153,6 +153,27 @@ def test_the_compiled_backend_equals_the_reference_at_full_size(
 ) -> None:
     options: dict[str, Any] = {"channels": 14, "hidden": 15, **LARGE[name]}
     agree(problem(seed=7, dtype=dtype, scale=0.15, **options))
+
+
+@needs_cpu
+@pytest.mark.parametrize("keep", [True, False], ids=["with a tape", "without a tape"])
+@pytest.mark.parametrize("decay", ["none", "delta"])
+def test_the_last_steps_of_a_silence_alone_have_a_gradient(decay: str, keep: bool) -> None:
+    case = problem(
+        seed=5, batch=21, rows=3, channels=2, hidden=3, cell="gru", flow="euler, nodes",
+        decay=decay, bounded=True, anchored=True, units=(4,), scale=0.1, dtype=torch.float64,
+    )  # fmt: skip
+    assert case.rows.node is not None
+    node = case.rows.node.clone()
+    node[::3, 1] += spec.TRACKED_NODES + 30
+    case = case._replace(rows=replace(case.rows, node=node))
+    agree(case, keep=keep)
+    rows, commit = case.rows, torch.ones_like(node)
+    for far, reached in ((spec.TRACKED_NODES, True), (spec.TRACKED_NODES + 1, False)):
+        one = replace(rows, first_node=0 * node, node=0 * node + far, commit=commit)
+        before, _ = cpu.scan(case.spec, case.weights, one, case.state)
+        (gradient,) = torch.autograd.grad(before[:, 0].sum(), case.state)
+        assert bool((gradient != 0).any()) == reached
 
 
 @needs_cpu

@@ -58,16 +58,17 @@ template <class T>
 int most_steps(const Spec& s, const Call<T>& call) {
   const InputPointers<T>& in = call.job.inputs;
   if (s.nodes) {
-    int most = 1;
+    // A block takes the most steps of its lanes, and one more if any of them needs it.
+    int whole = 0, read = s.field.layers ? 0 : 1;
     for (size_t i = 0; i < call.source.size(); ++i)
       for (int64_t row = 0; row < call.length[i]; ++row) {
         auto at = [&](const Quantity<T>& q) {
           return q.data[call.source[i] * q.by_lane + row * q.by_row];
         };
-        const bool read = at(in.gap) > 0 || s.decay_features;
-        most = std::max(most, steps_to_node(at(in.first_node), at(in.node)) + read);
+        whole = std::max(whole, steps_to_node(at(in.first_node), at(in.node)));
+        if (at(in.gap) > 0 || s.decay_features) read = 1;
       }
-    return most;
+    return std::max(1, std::min(whole, TRACKED_NODES + 1) + read);
   }
   const Quantity<T>& gap = in.gap;
   T longest = 0;

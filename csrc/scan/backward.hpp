@@ -129,12 +129,12 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
     zero(to_before, int64_t(d.H) * W);
   }
   if (s.nodes && !p.read) reach_node();
-  for (int q = p.whole + p.read - 1; q >= 0; --q) {
-    const T* step = at(l.step) + int64_t(q) * l.step_size * W;
+  for (int q = p.whole + p.read - 1; q >= p.untracked; --q) {
+    const T* step = at(l.step) + p.place(q) * l.step_size * W;
     set_step<P>(s, f, q, p);
     if (s.nodes && p.read && q == p.whole - 1) reach_node();
     if (s.field.layers) {
-      T* kept = to(k.places.field) + int64_t(q) * s.stages * k.places.field_size * W;
+      T* kept = to(k.places.field) + p.place(q) * s.stages * k.places.field_size * W;
       runge_kutta_backward<P>(k, p.span, g, step + l.stage * W, step + l.limited * W, kept);
     }
     if (!d.F) continue;
@@ -167,9 +167,11 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
       const V to_reached = to_bounded * inside(e.reached);
       V start = load<T>(to_start + i) + (1 - e.fraction) * to_reached;
       V end = load<T>(to_end + i) + e.fraction * to_reached;
-      if (q == 0 && s.decay_rows == CONTINUOUS) {
+      if (q == p.untracked && s.decay_rows == CONTINUOUS) {
         const V began = s.nodes ? fma(e.began, last - first, first) : first;
-        const V to_began = e.fresh != T(0) ? splat(0) : to_previous * inside(began);
+        V to_began = e.fresh != T(0) ? splat(0) : to_previous * inside(began);
+        if (p.untracked)
+          to_began = load<T>(p.later + lane) >= T(p.untracked) ? to_began : splat(0);
         start = start + (1 - e.began) * to_began;
         end = end + e.began * to_began;
       }
@@ -179,6 +181,10 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
     });
   }
   if (s.nodes && p.read && !p.whole) reach_node();
+  if (p.untracked)  // no gradient reaches the state before them
+    for (int i = 0; i < W; ++i)
+      if (p.cut(i))
+        for (int u = 0; u < d.D; ++u) g[int64_t(u) * W + i] = 0;
   if (d.F) {
     P::each(d.H, [&](int64_t i, int lane) {
       const V valid = load<T>(f.valid + lane);

@@ -30,16 +30,24 @@ static int steps_of(const Spec& s, const T* gap, T* steps) {
 }
 
 // The steps of one row. Without nodes, `whole` steps divide the gap. With nodes, `whole` steps lead
-// to the last node, and one more reads the row where `read` is set.
+// to the last node, and one more reads the row where `read` is set. Lanes end at the same step.
+// The last TRACKED_NODES steps have a gradient and places of their own on the tape; those before
+// share the place 0.
 template <class P>
 struct Steps {
   static constexpr int N = P::ONE ? VW : P::W;
-  int whole = 1, read = 0;
+  int whole = 1, read = 0, untracked = 0;
   T count[N];     // without nodes: steps of each lane
   T span[N];      // length of the current step
   T fraction[N];  // of the time between the inputs of the decay, at the end of the step
   T active[N];    // with nodes: 0 where a lane has taken its steps
   T first[N];     // with nodes: the fraction at the first node
+  T later[N];     // with nodes: how many steps a lane begins later than the first one
+  int64_t place(int step) const {
+    return !untracked ? step : step < untracked ? 0 : step - untracked + 1;
+  }
+  // A lane has steps without a gradient.
+  bool cut(int lane) const { return T(untracked) > later[lane]; }
 };
 template <class P>
 static Steps<P> steps_to_row(const Spec& s, const RowInputs<P>& f) {
@@ -55,7 +63,10 @@ static Steps<P> steps_to_row(const Spec& s, const RowInputs<P>& f) {
     const bool fresh = s.decay_features && f.node[i] == 0 && f.updated[i] != 0;
     if (f.gap[i] > 0 || fresh) p.read = 1;
     p.first[i] = f.first[i] * T(s.max_step) / T(s.decay_span);
+    p.later[i] = T(whole);
   }
+  for (int i = 0; i < Steps<P>::N; ++i) p.later[i] = T(p.whole) - p.later[i];
+  if (p.whole > TRACKED_NODES) p.untracked = p.whole - TRACKED_NODES;
   return p;
 }
 template <class P>
@@ -66,8 +77,8 @@ static void set_step(const Spec& s, const RowInputs<P>& f, int k, Steps<P>& p) {
       continue;
     }
     const bool read = k == p.whole;
-    const T node = read ? f.node[i] : f.first[i] + T(k + 1);
-    p.active[i] = read || node <= f.node[i];
+    const T node = read ? f.node[i] : f.first[i] + (T(k + 1) - p.later[i]);
+    p.active[i] = read || T(k) >= p.later[i];
     p.span[i] = read ? f.gap[i] : p.active[i] * T(s.max_step);
     p.fraction[i] = (node * T(s.max_step) + (read ? f.gap[i] : T(0))) / T(s.decay_span);
   }
@@ -170,12 +181,12 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   for (int k = 0; k < p.whole + p.read; ++k) {
     if (s.nodes && k == p.whole) copy<P>(units, state, at(l.node));
     set_step<P>(s, f, k, p);
-    T* step = at(l.step) + int64_t(k) * l.step_size * W;
+    T* step = at(l.step) + p.place(k) * l.step_size * W;
     if (d.F) {
       T* applied = step + l.applied * W;
       T* factor = step + l.factor * W;
       T* arrived = step + l.arrived * W;
-      const T* previous = applied - l.step_size * W;
+      const T* previous = p.place(k) ? applied - l.step_size * W : applied;
       P::each(d.H, [&](int64_t i, int lane) {
         const V first = load<T>(start + i), last = load<T>(end + i);
         const V updated = load<T>(f.updated + lane);

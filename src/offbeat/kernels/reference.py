@@ -15,6 +15,7 @@ from torch.nn.functional import linear, silu
 from offbeat.kernels.spec import (
     HIDDEN_LIMIT,
     LARGEST_EXPONENT,
+    TRACKED_NODES,
     Layers,
     ScanCell,
     ScanParts,
@@ -336,6 +337,10 @@ class _Nodes:
 
         def step(node: Tensor, y: Tensor, *applied: Tensor) -> tuple[Tensor, ...]:
             active = node < last
+            if not spec.loops:
+                cut = (last - node == TRACKED_NODES) & (node > first)
+                y = torch.where(cut, y.detach(), y)
+                applied = tuple(torch.where(cut, each.detach(), each) for each in applied)
             span = torch.where(active, length, none)
             if decay is not None:
                 since = (node + 1) * length / unit

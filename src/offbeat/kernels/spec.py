@@ -26,6 +26,10 @@ LARGEST_EXPONENT = 30.0
 MOST_NODES = 2048
 """Number of solver nodes after an observed row; beyond the last one the state stays as it is."""
 
+TRACKED_NODES = 256
+"""Number of steps from node to node before a row that have a gradient. It bounds the memory of a
+long silence, over which gradients grow or vanish."""
+
 HIDDEN_LIMIT = 10.0
 """Bound of a hidden unit in a bounded scan."""
 
