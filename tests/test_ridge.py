@@ -9,6 +9,7 @@ import pytest
 
 import offbeat as ob
 from offbeat.baselines import cross_fitted, fit_baseline, folds_of
+from offbeat.baselines.folds import row_folds
 from offbeat.baselines.held_out import Products, held_out_ridge
 from offbeat.baselines.kernel_ridge import gaussians, whitening
 from offbeat.baselines.ridge_fill import backwards
@@ -245,6 +246,24 @@ def test_folds_of_one_source_are_blocks_of_time():
     first = np.array([note[2] for note in tasks.meta["tasks"]])
     assert np.bincount(fold).tolist() == [10] * 4
     assert all(first[fold == k].max() <= first[fold == k + 1].min() for k in range(3))
+
+
+def test_rows_of_one_time_are_in_one_fold_in_all_windows():
+    data = second_order(2, seed=0)
+    tasks = draw_tasks(data, TaskConfig(horizon_s=0.05, gap_s=GAP, window_s=0.2), 40)
+    folds = row_folds(tasks, 4)
+    found: dict[tuple[int, int], set[int]] = {}
+    for (_, source, first), fold in zip(tasks.meta["tasks"], folds, strict=True):
+        for i, f in enumerate(fold.tolist()):
+            found.setdefault((source, first + i), set()).add(f)
+    assert all(len(seen) == 1 for seen in found.values())
+    # 140 rows of two trajectories, in order: blocks of 35.
+    blocks = [next(iter(found[key])) for key in sorted(found)]
+    assert blocks == sorted(blocks)
+    assert set(blocks) == {0, 1, 2, 3}
+    many = draw_tasks(second_order(12, seed=0), TaskConfig(horizon_s=0.05, gap_s=GAP), 40)
+    whole = folds_of(many, 4)
+    assert all((rows == f).all() for rows, f in zip(row_folds(many, 4), whole, strict=True))
 
 
 def test_cross_fitted_predictions_are_those_of_a_fit_without_the_source():

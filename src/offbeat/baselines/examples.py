@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.baselines.base import Array, moments, padded
-from offbeat.baselines.folds import folds_of
+from offbeat.baselines.folds import row_folds
 from offbeat.baselines.history import History
+from offbeat.data.tasks import take_tasks
 from offbeat.data.trajectory import Dataset
 
 if TYPE_CHECKING:
@@ -70,8 +71,9 @@ def examples_of(baseline: Ridge, tasks: Dataset) -> Examples:
     The distance of the later ones is log-uniform.
     """
     random = np.random.default_rng(0)
-    fraction = min(baseline.most_states, CELLS / tasks.channels) / sum(t.rows for t in tasks)
-    folds = folds_of(tasks, FOLDS)
+    most = min(baseline.most_states, CELLS / tasks.channels)
+    fraction = most / sum(t.rows for t in tasks)
+    folds = row_folds(tasks, FOLDS)
     states: list[tuple[NDArray[Any], ...]] = []
     reads: list[tuple[NDArray[Any], ...]] = []
     first = count = 0
@@ -83,7 +85,7 @@ def examples_of(baseline: Ridge, tasks: Dataset) -> Examples:
             part = {name: array[chosen] for name, array in state.items()}
             last = History.last(part, baseline.mean)
             features, moved = baseline.features(part), baseline.moved(part)
-            fold = folds[first + chosen]
+            fold = np.array([folds[first + k][i] for k in chosen.tolist()], dtype=np.int64)
             states.append((features.astype(np.float32), moved.astype(np.float32), fold))
             longest = lengths[chosen] - 1 - i
             for draw in (np.zeros(len(chosen)), *random.random((2, len(chosen)))):
@@ -109,6 +111,18 @@ def examples_of(baseline: Ridge, tasks: Dataset) -> Examples:
         *(np.concatenate(parts) for parts in zip(*states, strict=True)),
         *(np.concatenate(parts) for parts in zip(*reads, strict=True)),
     )
+
+
+def some_tasks(tasks: Dataset, rows: float) -> Dataset:
+    """Tasks in random order, up to a number of rows.
+
+    Args:
+        tasks: from `draw_tasks`, or any data set.
+        rows: at which the next task is left out.
+    """
+    order = np.random.default_rng(0).permutation(len(tasks))
+    total = np.cumsum([tasks[i].rows for i in order.tolist()])
+    return take_tasks(tasks, order[: 1 + int(np.searchsorted(total, rows))])
 
 
 def likeness(tasks: Dataset) -> Array:

@@ -24,11 +24,7 @@ def folds_of(tasks: Dataset, count: int) -> NDArray[np.int64]:
     Returns:
         (tasks,) from 0 to less than `count`.
     """
-    notes = tasks.meta.get("tasks")
-    if notes is None or len(notes) != len(tasks):
-        notes = [["", i, 0] for i in range(len(tasks))]
-    source = np.array([note[1] for note in notes])
-    first = np.array([note[2] for note in notes])
+    source, first = _sources(tasks)
     names, at, many = np.unique(source, return_inverse=True, return_counts=True)
     if len(names) < 2 * count:
         order = np.lexsort((first, source))
@@ -41,6 +37,40 @@ def folds_of(tasks: Dataset, count: int) -> NDArray[np.int64]:
         fold[name] = sizes.argmin()
         sizes[fold[name]] += many[name]
     return fold[at]
+
+
+def row_folds(tasks: Dataset, count: int) -> list[NDArray[np.int64]]:
+    """The fold of every row of every task: rows of one time are in the same fold in all windows.
+
+    As `folds_of` where there are many sources; else the sources are divided in blocks of time.
+
+    Args:
+        tasks: as of `folds_of`.
+        count: of folds.
+
+    Returns:
+        Per task (rows,) from 0 to less than `count`.
+    """
+    source, first = _sources(tasks)
+    names, at = np.unique(source, return_inverse=True)
+    if len(names) >= 2 * count:
+        of_task = folds_of(tasks, count)
+        return [np.full(t.rows, f) for t, f in zip(tasks, of_task.tolist(), strict=True)]
+    lengths = np.zeros(len(names), dtype=np.int64)
+    np.maximum.at(lengths, at, first + np.array([t.rows for t in tasks]))
+    before = np.cumsum(lengths) - lengths
+    return [
+        (start + np.arange(t.rows)) * count // int(lengths.sum())
+        for t, start in zip(tasks, (before[at] + first).tolist(), strict=True)
+    ]
+
+
+def _sources(tasks: Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(tasks,) source and first row of every task."""
+    notes = tasks.meta.get("tasks")
+    if notes is None or len(notes) != len(tasks):
+        return np.arange(len(tasks)), np.zeros(len(tasks), dtype=np.int64)
+    return np.array([note[1] for note in notes]), np.array([note[2] for note in notes])
 
 
 def cross_fitted(

@@ -14,7 +14,7 @@ from offbeat.baselines.base import (
     State,
     namespace,
 )
-from offbeat.baselines.examples import FURTHEST, Examples, examples_of, likeness
+from offbeat.baselines.examples import FURTHEST, Examples, examples_of, likeness, some_tasks
 from offbeat.baselines.held_out import held_out_ridge
 from offbeat.baselines.history import AgeBins, History, longest_age, typical_gap
 from offbeat.baselines.simple import as_kind
@@ -25,6 +25,9 @@ SPANS = (1, 2, 4)
 
 AVERAGES = 2
 """Exponential averages of each channel."""
+
+ROWS = 250_000
+"""Most rows of the tasks that a fit looks at."""
 
 FOLLOWED = 16
 """Most channels whose motion since a channel was observed is followed."""
@@ -183,6 +186,11 @@ class Ridge(CausalBaseline):
         gap, longest = typical_gap(tasks), longest_age(tasks)
         self.edges = AgeBins.of(tasks).edges
         self.averages = np.geomspace(4 * gap, max(longest, 8 * gap), AVERAGES)
+        known = [np.where(t.known, t.values, np.nan) for t in tasks]
+        every = np.concatenate([*known, np.where(np.isfinite(self.mean), self.mean, 0.0)[None]])
+        low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
+        self.bound = np.stack([low - 0.5 * (high - low), high + 0.5 * (high - low)])
+        tasks = some_tasks(tasks, ROWS)
         alike = likeness(tasks)
         order = np.argsort(-alike, axis=1, kind="stable")
         self.followed = np.ascontiguousarray(order[:, 1 : FOLLOWED + 1])
@@ -190,10 +198,6 @@ class Ridge(CausalBaseline):
         self._measure(found.features)
         features = self._limited(found.features).astype(np.float32)
         self._solve(found, features, alike)
-        known = [np.where(t.known, t.values, np.nan) for t in tasks]
-        every = np.concatenate([*known, np.where(np.isfinite(self.mean), self.mean, 0.0)[None]])
-        low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
-        self.bound = np.stack([low - 0.5 * (high - low), high + 0.5 * (high - low)])
 
     def _measure(self, features: Array) -> None:
         """Limits and spreads of the features."""

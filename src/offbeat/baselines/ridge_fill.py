@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.baselines.base import BASELINES, Array, Baseline, padded
-from offbeat.baselines.examples import FOLDS, likeness
-from offbeat.baselines.folds import folds_of
+from offbeat.baselines.examples import FOLDS, likeness, some_tasks
+from offbeat.baselines.folds import row_folds
 from offbeat.baselines.gaps import EACH, OWN, SIZE, Gaps, longest_gap
 from offbeat.baselines.held_out import Products
 from offbeat.baselines.history import AgeBins, typical_gap
 from offbeat.baselines.ridge import Ridge
 from offbeat.data.arrays import hand_over
-from offbeat.data.tasks import take_tasks
 from offbeat.data.trajectory import Dataset, Trajectory
+
+CELLS = 4_000_000
+"""Most rows of the tasks that a fit uses, times channels."""
 
 NEAR = 8
 """Most other channels that a fill uses."""
@@ -94,21 +96,23 @@ class RidgeFill(Baseline):
         self.forward.fit(tasks)
         self.backward.fit(backwards(tasks))
         self.bound = self.forward.bound
-        alike = np.argsort(-likeness(tasks), axis=1, kind="stable")
+        some = some_tasks(tasks, CELLS / tasks.channels)  # the first measure the features
+        alike = np.argsort(-likeness(some), axis=1, kind="stable")
         self.near = np.ascontiguousarray(alike[:, 1 : NEAR + 1])
-        self.edges = AgeBins.of_lengths(2 * typical_gap(tasks), longest_gap(tasks)).edges
+        self.edges = AgeBins.of_lengths(2 * typical_gap(tasks), longest_gap(some)).edges
         bins, channels = len(self.edges), tasks.channels
         size = OWN + EACH * self.near.shape[1]
         products = np.zeros((KINDS * bins, channels, FOLDS, size + 1, size + 1))
         counts = np.zeros((KINDS * bins, channels, FOLDS))
-        order = np.random.default_rng(0).permutation(len(tasks))  # the first measure the features
-        folds = folds_of(tasks, FOLDS)[order]
+        folds = row_folds(some, FOLDS)
         self.limits = np.zeros((2, channels, size))
         measured = np.zeros(channels, dtype=bool)
         first = 0
-        for rows in padded(take_tasks(tasks, order), SIZE):
+        for rows in padded(some, SIZE):
             gaps = Gaps(rows, self.mean, self.scale)
-            fold = folds[first : first + len(rows.lengths)]
+            fold = np.zeros(rows.times.shape, dtype=np.int64)
+            for i, length in enumerate(rows.lengths):
+                fold[i, :length] = folds[first + i]
             first += len(rows.lengths)
             for c in range(channels):
                 task, row = gaps.inside(c)
@@ -123,7 +127,7 @@ class RidgeFill(Baseline):
                 truth = (rows.values[task, row, c] - self.mean[c]) / self.scale[c]
                 both = np.column_stack([features, truth - gaps.line[task, row, c]])
                 key = self._key(gaps, c, task, row)
-                place = np.where(rows.known[task, row, c], key * FOLDS + fold[task], -1)
+                place = np.where(rows.known[task, row, c], key * FOLDS + fold[task, row], -1)
                 for one in np.unique(place[place >= 0]).tolist():
                     some = both[place == one]
                     products[one // FOLDS, c, one % FOLDS] += some.T @ some
