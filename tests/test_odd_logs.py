@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from offbeat.cli.app import main
 from offbeat.config import SplitConfig
 from offbeat.data.plan import find_sensors, plan, prepare
 from offbeat.data.redundant import Redundant
+from offbeat.data.representative import unlikeness
 from offbeat.data.splits import split_in_blocks
 from offbeat.data.tasks import draw_tasks
 
@@ -159,6 +161,16 @@ def test_bursts_and_dropouts_are_silences():
     assert long.horizon_s == 1.0
 
 
+def test_windows_are_three_times_the_longest_silence_where_the_log_has_room():
+    times = at(20, 400)
+    values = motion(times)
+    values[:, [2]] = out(times, values[:, [2]], [(100, 107), (300, 302)])
+    chosen = plan(log(times, values))
+    assert chosen.longest_silence_s == pytest.approx(7.05)
+    assert chosen.window_s == pytest.approx(3 * 7.05, rel=0.01)
+    assert not [note for note in chosen.notes if "less than three times" in note]
+
+
 def test_the_horizon_follows_the_motion():
     times = at(50, 120)
     slow, fast = (np.sin(2 * np.pi * rate * times)[:, None] for rate in (0.05, 1.0))
@@ -216,6 +228,9 @@ def test_a_single_manoeuvre_is_in_the_training_part_and_in_validation_where_it_c
     lacking = [i for i in (1, 2) if rows[i] < 5]
     said = [note for note in chosen.notes if "is at rest" in note]
     assert len(said) >= len(lacking), "what is missing is said"
+    others = [replace(whole, seed=1000 * k) for k in range(24)]
+    least = min(unlikeness(*ob.apply_split(dataset, one)) for one in others)
+    assert unlikeness(*ob.apply_split(dataset, whole)) == least
 
 
 def test_a_channel_that_the_training_part_lacks_is_said_and_left_out():

@@ -277,6 +277,14 @@ def test_blocks_follow_from_the_seed_and_are_at_no_regular_places():
     )
     assert first == again
     assert first[1] != other[1]
+    applied = [
+        [
+            rows_of(part)
+            for part in apply_split(Dataset((log(1000),)), SplitConfig(by="blocks", seed=seed))
+        ]
+        for seed in (1, 2)
+    ]
+    assert applied == [first, other]
     phases = [
         float(t.values[0, 0]) % 200 / 200
         for seed in range(40)
