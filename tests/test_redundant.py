@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -175,6 +176,13 @@ def test_a_model_of_it_takes_the_raw_log_and_gives_constants_and_copies_back(nam
         assert np.isnan(columns["broken"]).all()
     columns = dict(zip(filled.names, filled.values.T, strict=True))
     assert np.array_equal(columns["seq"], np.arange(ROWS)), "what was measured stays"
+
+
+def test_statistics_of_channels_without_a_value_are_finite_numbers():
+    statistics = small_model("gru", prepared(), scaler="robust").statistics
+    json.dumps(statistics.to_dict(), allow_nan=False)
+    assert (statistics.low[0], statistics.high[0]) == (0.0, 0.0)
+    assert statistics.low[1] < -1 < 1 < statistics.high[1]
 
 
 def test_what_is_left_out_changes_no_prediction():

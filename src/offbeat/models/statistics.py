@@ -26,8 +26,8 @@ class Statistics:
         longest_elapsed: s, longest time since the last observed row.
         longest_delta: s, longest time since observation of any channel (equation 25).
         rows: of the longest training trajectory; 0 in checkpoints of 0.1.
-        low: per channel, smallest observed value; empty in checkpoints up to 0.2.
-        high: per channel, largest observed value.
+        low: per channel, smallest observed value, 0 without one; empty in checkpoints up to 0.2.
+        high: per channel, largest observed value, 0 without one.
     """
 
     mean: tuple[float, ...]
@@ -81,6 +81,9 @@ class Statistics:
                 "every training trajectory has a single row; a model needs at least one "
                 "trajectory of two rows"
             )
+        low = torch.where(mask, values, torch.inf).amin(dim=(0, 1))
+        high = torch.where(mask, values, -torch.inf).amax(dim=(0, 1))
+        never = low > high  # exogenous ones without a value
         longest = [_longest(batch, mask.any(dim=2, keepdim=True)), _longest(batch, mask)]
         return cls(
             tuple(mean.tolist()),
@@ -89,8 +92,8 @@ class Statistics:
             max(longest[0], float(gaps.median())),
             max(*longest, float(gaps.median())),
             batch.rows,
-            tuple(torch.where(mask, values, torch.inf).amin(dim=(0, 1)).tolist()),
-            tuple(torch.where(mask, values, -torch.inf).amax(dim=(0, 1)).tolist()),
+            tuple(torch.where(never, 0.0, low).tolist()),
+            tuple(torch.where(never, 0.0, high).tolist()),
         )
 
     def to_dict(self) -> dict[str, Any]:
