@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from model_helpers import small_model, trajectory
+from model_helpers import draw_weights, small_model, trajectory
 from stream_helpers import message
+from task_helpers import TASKS, TRAIN, VALIDATION
 from test_contract import FLOAT32, FLOAT64, TOLERANCE, VARIANTS, build, dtypes
 from torch import Tensor
 
@@ -25,10 +26,13 @@ from offbeat import (
     export_onnx,
     save_model,
 )
+from offbeat.baselines import fit_baseline
 from offbeat.cli.app import main
+from offbeat.data.tasks import draw_tasks
 from offbeat.export.exporter import StreamStep, _traceable
 from offbeat.export.runner import STATE
-from offbeat.models.zoo import ZOO
+from offbeat.models.corrected import CorrectedModel
+from offbeat.models.zoo import ZOO, make_model
 
 FIXED = [
     name
@@ -133,6 +137,34 @@ def test_an_exported_model_of_double_precision_keeps_it(exported: Any) -> None:
     path = exported("ode_gru_d-decay_rk4", FLOAT64)
     model = made("ode_gru_d-decay_rk4", FLOAT64)
     check_parity(model, OnnxStream(path, time_unit="ns", late="reorder"), 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("base", "name"),
+    [
+        ("damped_slope", "anchored_ode_gru_d"),
+        pytest.param("kalman_short", "ode_gru_d", marks=pytest.mark.slow),
+    ],
+)
+def test_an_exported_model_that_corrects_a_baseline_predicts_what_its_stream_predicts(
+    base: str, name: str, tmp_path: Path
+) -> None:
+    tasks = draw_tasks(TRAIN, TASKS, 60, seed=9)
+    inner = make_model(name, TRAIN, hidden_size=4, decoder_units=(4,), field_units=(4,))
+    model = CorrectedModel.of(draw_weights(inner), fit_baseline(base, tasks), tasks)
+    export_onnx(model, tmp_path / "model.onnx")
+    live, onnx = Stream(model), OnnxStream(tmp_path / "model.onnx")
+    for time, values, observed in zip(
+        VALIDATION[0].times, VALIDATION[0].values, VALIDATION[0].observed, strict=True
+    ):
+        ahead = float(time) + 0.3
+        np.testing.assert_allclose(onnx.predict(ahead), live.predict(ahead), atol=1e-5)
+        seen = np.where(observed & (time % 1 < 0.7), values, np.nan)
+        live.observe(float(time), seen)
+        onnx.observe(float(time), seen)
+    again = OnnxStream(tmp_path / "model.onnx")
+    again.restore(onnx.state())
+    assert np.array_equal(again.predict(ahead), onnx.predict(ahead))
 
 
 def test_any_runtime_can_run_the_file_from_what_stands_in_it(exported: Any) -> None:

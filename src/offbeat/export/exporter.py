@@ -18,16 +18,19 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from offbeat import kernels
+from offbeat.baselines.history import History
 from offbeat.data.batch import Batch
 from offbeat.errors import InputError, one_of, require
-from offbeat.export.runner import FORMAT, METADATA, STATE, VERSION
+from offbeat.export.runner import FORMAT, METADATA, STATE, VERSION, WITHOUT_BASE
 from offbeat.files import atomic_path
+from offbeat.models.corrected import CorrectedModel
 from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model
 from offbeat.ode import tableau
+from offbeat.stream.blend_engine import flat_state, like_state
 
 
-def export_onnx(model: Model, path: str | Path) -> None:
+def export_onnx(model: Model | CorrectedModel, path: str | Path) -> None:
     """Writes one streaming step of a model as an ONNX file, for `OnnxStream` or any ONNX runtime.
 
     Inputs: `t` (1,) float64, s, since any fixed origin; `values` (1, channels) float64 in original
@@ -38,7 +41,8 @@ def export_onnx(model: Model, path: str | Path) -> None:
     transforms are JSON in the metadata under `offbeat`.
 
     The graph is a trace of `model.forward` in the reference backend, for one row. The steps of the
-    solver from node to node are a loop in it.
+    solver from node to node are a loop in it. Where the model corrects a baseline, the baseline and
+    its state are part of the graph.
 
     Args:
         model: trained.
@@ -55,19 +59,24 @@ def export_onnx(model: Model, path: str | Path) -> None:
     _check_exportable(model)
     onnx = require("onnx", "export")
     optimizer: Any = require("onnxscript.optimizer", "export")
-    past = model.empty_state(1)
+    inner = model.inner if isinstance(model, CorrectedModel) else model
+    past = inner.empty_state(1)
     initial = {name: getattr(past, name).detach().cpu().clone() for name in STATE}
+    step: nn.Module = StreamStep(inner)
+    if isinstance(model, CorrectedModel):
+        step = CorrectedStep(model)
+        initial |= step.initial()
     inputs = (
         torch.zeros(1, dtype=torch.float64),
         torch.zeros((1, model.channels), dtype=torch.float64),
         *initial.values(),
     )
-    with torch.no_grad(), _quiet(), _traceable(model):
+    with torch.no_grad(), _quiet(), _traceable(inner):
         program: Any = torch.onnx.export(
-            StreamStep(model).eval(),
+            step.eval(),
             inputs,
-            input_names=["t", "values", *STATE],
-            output_names=["prediction", *(f"{name}_next" for name in STATE)],
+            input_names=["t", "values", *initial],
+            output_names=["prediction", *(f"{name}_next" for name in initial)],
             dynamo=True,
             optimize=False,
             verbose=False,
@@ -121,6 +130,59 @@ class StreamStep(nn.Module):
             return prediction, *(getattr(output.past, name).clone() for name in STATE)
 
 
+class CorrectedStep(nn.Module):
+    """The same for a model that corrects a baseline, whose state is further parts.
+
+    Args:
+        model: its inner model runs within `_traceable`.
+    """
+
+    def __init__(self, model: CorrectedModel) -> None:
+        super().__init__()
+        self.model, self.history = model, History(1)
+        self.inner = StreamStep(model.inner)
+
+    def empty(self) -> dict[str, Any]:
+        """The nested state of the baseline before the first row."""
+        zeros = np.zeros((1, self.model.channels))
+        return {"base": self.model.base.start(zeros), "history": self.history.start(zeros)}
+
+    def initial(self) -> dict[str, Tensor]:
+        """The same, flat, by the names of the inputs."""
+        return {k: torch.from_numpy(v.copy()) for k, v in flat_state(self.empty()).items()}
+
+    def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """Prediction and next state, as of `StreamStep`, and then those of the baseline."""
+        model, own = self.model, state[len(STATE) :]
+        mean, *after = self.inner(t, values, *state[: len(STATE)])
+        with _ExactNumbers():
+            given: dict[str, Any] = dict(zip(flat_state(self.empty()), own, strict=True))
+            past = like_state(self.empty(), given)
+            shift, scale = self.inner.shift, self.inner.scale
+            time = t[:, None]
+            base = (model.base.read(past["base"], time) - shift) / scale
+            output = (mean - shift) / scale
+            joined = model.joined(base, output, History.age(past["history"], time))
+            mask = ((values - shift) / scale).to(model.dtype).abs() < math.inf
+            row = (time, torch.where(mask, values, torch.zeros_like(values)), mask)
+            then = {
+                "base": model.base.observe(past["base"], *row),
+                "history": self.history.observe(past["history"], *row),
+            }
+            named = dict(_named(then))
+            nexts = [named[name].double().clone() for name in given]
+            return joined * scale + shift, *after, *nexts
+
+
+def _named(state: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Tensor]]:
+    """The tensors of nested states, with the names of `flat_state`."""
+    for name, value in state.items():
+        if isinstance(value, dict):
+            yield from _named(value, f"{prefix}{name}/")
+        else:
+            yield prefix + name, value
+
+
 class _ExactNumbers(TorchFunctionMode):
     """Converts Python numbers that are inexact in float32 to tensors, for the exporter."""
 
@@ -172,16 +234,18 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _record(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
+def _record(model: Model | CorrectedModel, initial: dict[str, Tensor]) -> dict[str, Any]:
     """The metadata that a stream needs besides the graph."""
-    limit = float(model.config.gap_limit or 1)
+    inner = model.inner if isinstance(model, CorrectedModel) else model
+    limit = float(inner.config.gap_limit or 1)
+    further = {name: value.tolist() for name, value in initial.items() if name not in STATE}
     finite = {  # JSON has no infinities: the runner sets the other initial values
         name: initial[name].tolist() for name in ("state", "last")
     }
     return {
         "format": FORMAT,
-        "version": VERSION,
-        "model": model.config.name,
+        "version": VERSION if further else WITHOUT_BASE,
+        "model": model.name,
         "names": list(model.names),
         "units": list(model.units),
         "roles": list(model.roles),
@@ -190,10 +254,12 @@ def _record(model: Model, initial: dict[str, Tensor]) -> dict[str, Any]:
         "transforms": model.transforms.to_dict(),
         "dtype": str(model.dtype).removeprefix("torch."),
         "initial": finite,
+        **({"base": further} if further else {}),
     }
 
 
-def _check_exportable(model: Model) -> None:
+def _check_exportable(model: Model | CorrectedModel) -> None:
+    model = model.inner if isinstance(model, CorrectedModel) else model
     if not isinstance(model, Model):
         raise InputError(
             f"the model {model.name!r} has no recurrent state, so no step to export; stream it "

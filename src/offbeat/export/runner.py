@@ -18,7 +18,10 @@ from offbeat.stream.live import LiveStream, StreamInfo
 from offbeat.stream.options import StreamOptions, with_options
 
 FORMAT = "offbeat-step"
-VERSION = 2
+VERSION = 3
+WITHOUT_BASE = 2
+"""Version of a file of a model that corrects no baseline; version 3 has the state of one."""
+
 METADATA = "offbeat"
 """Key of a JSON object in the metadata of the file."""
 
@@ -95,7 +98,8 @@ class OnnxEngine(Engine):
             ) from None
         self._session, self._digest = session, hashlib.sha256(data).hexdigest()
         self._unmeasured = np.full((1, len(self.info.names)), np.nan)
-        self._next = [f"{name}_next" for name in STATE]
+        self._parts = list(self._initial)
+        self._next = [f"{name}_next" for name in self._parts]
         self._slots: list[Arrays] = []
         self.reset()
 
@@ -116,7 +120,7 @@ class OnnxEngine(Engine):
         """Consumes one row."""
         row = np.where(mask, values, np.nan)[None]
         found = self._session.run(self._next, {"t": np.array([time]), "values": row, **self._state})
-        self._state = dict(zip(STATE, found, strict=True))
+        self._state = dict(zip(self._parts, found, strict=True))
 
     def predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Runs the step without measurements for each time; does not change the state."""
@@ -147,7 +151,7 @@ class OnnxEngine(Engine):
 
 def _read(record: Any) -> tuple[StreamInfo, Arrays]:
     """Reads the metadata: properties of the stream, and the initial state."""
-    if record["format"] != FORMAT or record["version"] not in (1, VERSION):
+    if record["format"] != FORMAT or record["version"] not in range(1, VERSION + 1):
         raise FileFormatError(
             f"the ONNX file is a {record['format']!r} of version {record['version']!r}, this "
             f"Offbeat runs {FORMAT!r} of versions 1 to {VERSION}; export the model again"
@@ -170,4 +174,5 @@ def _read(record: Any) -> tuple[StreamInfo, Arrays]:
         transforms=Transforms.from_dict(record["transforms"] if record["version"] > 1 else _NONE),
         roles=tuple(record.get("roles", ())),
     )
-    return info, {name: initial[name] for name in STATE}
+    base = {name: np.array(v, dtype=np.float64) for name, v in record.get("base", {}).items()}
+    return info, {**{name: initial[name] for name in STATE}, **base}
