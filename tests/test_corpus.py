@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import fuzz
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from corpus import logs, tables
 
+from offbeat.cli.app import main
+from offbeat.cli.common import read_log
 from offbeat.data.readers import read
+from offbeat.data.trajectory import Trajectory
 from offbeat.errors import FileFormatError, InputError, OffbeatError
 
 WRITTEN = [(name, form) for name, kind in tables.KINDS.items() for form in kind.formats]
@@ -34,6 +40,34 @@ def test_a_table_has_the_times_and_values_that_it_means(name, form, tmp_path):
     assert kind.note in notes(dataset)
 
 
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"time": pa.array(tables.STEP_NS // 1000 * np.arange(tables.ROWS), pa.time64("us"))},
+        {"time": pa.array(20 * np.arange(tables.ROWS, dtype=np.int32), pa.time32("ms"))},
+        {"time": pa.array(tables.NS, pa.timestamp("ns"))},
+        {"time": pa.array(tables.NS - tables.NS[0], pa.duration("ns"))},
+        {
+            "date": pa.array([20_000] * tables.ROWS, pa.date32()),
+            "time": pa.array(tables.STEP_NS * np.arange(tables.ROWS), pa.time64("ns")),
+        },
+    ],
+    ids=["time64", "time32", "timestamp", "duration", "date32 and time64"],
+)
+def test_times_of_parquet_know_their_unit(columns, tmp_path):
+    pq.write_table(pa.table({**columns, **tables.XY}), tmp_path / "log.parquet")
+    dataset = read(tmp_path / "log.parquet")
+    assert dataset.names == ("x", "y")
+    assert dataset[0].times == pytest.approx(tables.TIMES, abs=1e-12)
+
+
+def test_dates_of_parquet_are_days(tmp_path):
+    columns = {"date": pa.array([20_000, 20_001, 20_003], pa.date32()), "x": [1.0, 2.0, 3.0]}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    dataset = read(tmp_path / "log.parquet", max_gap_s=None, clock_jumps="join")
+    assert dataset[0].times.tolist() == [0.0, 86_400.0, 3 * 86_400.0]
+
+
 @pytest.mark.parametrize("name", tables.TEXTS)
 def test_a_text_file_is_read_in_the_form_it_has(name, tmp_path):
     content, options, note = tables.TEXTS[name]
@@ -45,6 +79,18 @@ def test_a_text_file_is_read_in_the_form_it_has(name, tmp_path):
     assert trajectory.values.tolist() == np.column_stack([tables.X, tables.Y]).tolist()
     assert note in notes(dataset)
     assert dataset.units == (("m", "deg") if "units" in name else ("", ""))
+
+
+def test_logs_that_are_joined_are_an_episode_each(tmp_path):
+    columns = {"time": 10 * tables.TIMES, **tables.XY}
+    text = tables.write_csv(tmp_path / "log", columns).read_text()
+    (tmp_path / "log.csv").write_text(3 * text)
+    dataset = read(tmp_path / "log.csv")
+    assert [trajectory.values[:, 0].tolist() for trajectory in dataset] == 3 * [tables.X.tolist()]
+    assert "the header stands again in the middle" in notes(dataset)
+    (tmp_path / "log.csv").write_text(2 * text + "later,1,2\n")
+    with pytest.raises(FileFormatError, match=f"has 'later' in line {2 * tables.ROWS + 3}"):
+        read(tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize("text", tables.MISSING_TEXTS)
@@ -342,3 +388,84 @@ def test_eight_numbers_are_a_pose_only_by_their_header_or_their_quaternion(tmp_p
     path.write_text(POSE.replace("qw qx qy qz", "a b c d") + "0 1 2 3 4 5 6 7\n")
     with pytest.raises(FileFormatError, match=r"names its columns .* read it with format=csv"):
         read(path, format="tum")
+
+
+T0 = np.datetime64("2025-11-24T12:00", "ns")
+
+
+class TestArraysOfNumPy:
+    @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+    def test_of_dates_and_durations_keep_their_unit(self, unit):
+        steps = np.arange(5) * np.timedelta64(20_000_000_000, "ns").astype(f"m8[{unit}]")
+        for clock in (T0.astype(f"M8[{unit}]") + steps, steps + steps[1]):
+            trajectory = Trajectory.from_arrays(clock, np.zeros((5, 1)))
+            assert trajectory.times.tolist() == [0.0, 20.0, 40.0, 60.0, 80.0]
+
+    def test_of_dates_lose_no_nanosecond(self):
+        clock = T0 + np.array([0, 1, 3], "m8[ns]")
+        assert Trajectory.from_arrays(clock, np.zeros((3, 1))).times.tolist() == [0, 1e-9, 3e-9]
+
+    def test_of_minutes_and_days_are_in_seconds(self):
+        for unit, seconds in (("m", 60), ("h", 3600), ("D", 86_400)):
+            clock = np.arange(3).astype(f"m8[{unit}]")
+            times = Trajectory.from_arrays(clock, np.zeros((3, 1))).times
+            assert times.tolist() == [0, seconds, 2 * seconds]
+
+    def test_of_durations_are_seconds_in_a_trajectory_and_dates_are_refused(self):
+        durations = np.array([10, 30], "m8[ms]")
+        assert Trajectory(durations, [[1.0], [2.0]]).times.tolist() == [0.01, 0.03]
+        with pytest.raises(InputError, match=r"expected seconds; Trajectory.from_arrays"):
+            Trajectory(T0 + durations, [[1.0], [2.0]])
+
+    def test_with_nat_or_masked_times_are_refused(self):
+        with pytest.raises(InputError, match="NaT at row 1"):
+            Trajectory.from_arrays(np.array(["2025-01-01", "NaT"], "M8[s]"), [[1.0], [2.0]])
+        with pytest.raises(InputError, match="times are masked at row 1"):
+            Trajectory(np.ma.array([0.0, 1.0], mask=[False, True]), [[1.0], [2.0]])
+
+    def test_that_are_masked_hold_nothing_there(self):
+        values = np.ma.array([[1, 2], [3, 4]], mask=[[False, True], [False, False]])
+        for trajectory in (
+            Trajectory([0.0, 1.0], values),
+            Trajectory.from_arrays([0, 1], values, time_unit="s"),
+        ):
+            assert trajectory.observed.tolist() == [[True, False], [True, True]]
+            assert np.isnan(trajectory.values[0, 1])
+
+    def test_in_a_stream_keep_their_mask_and_need_a_plain_time(self):
+        model, other = fuzz.model(), fuzz.model()
+        masked, plain = fuzz.Stream(model), fuzz.Stream(other)
+        masked.observe(0.0, np.ma.array([0.5, 9.0], mask=[False, True]))
+        plain.observe(0.0, [0.5, np.nan])
+        assert masked.predict(0.1).tolist() == plain.predict(0.1).tolist()
+        for time in (T0, np.timedelta64(5, "ms")):
+            with pytest.raises(InputError, match="a time must be a number in s"):
+                masked.observe(time, [0.5, 1.0])
+
+
+def test_other_logs_are_read_in_the_unit_that_the_run_found(tmp_path):
+    """Steps of 20 are milliseconds; those of 1 alone would be taken for seconds."""
+    slow = {"time": 20 * np.arange(200), "x": np.sin(np.arange(200) / 9)}
+    fast = {"time": np.arange(200), "x": slow["x"]}
+    named = {"time_s": 0.02 * np.arange(200), "x": slow["x"]}
+    paths = {name: tables.write_csv(tmp_path / name, columns)
+            for name, columns in (("slow", slow), ("fast", fast), ("named", named))}  # fmt: skip
+    run = tmp_path / "run"
+    small = ["--model.name=gru", "--model.hidden_size=2", "--training.epochs=1"]
+    assert main(["train", str(paths["slow"]), str(run), *small]) == 0
+    assert read_log(paths["slow"], None, run=run)[0].times[-1] == pytest.approx(3.98)
+    assert read_log(paths["fast"], None, run=run)[0].times[-1] == pytest.approx(0.199)
+    assert read_log(paths["fast"], {"time_unit": "s"}, run=run)[0].times[-1] == 199
+    assert read_log(paths["named"], None, run=run)[0].times[-1] == pytest.approx(3.98)
+    assert read(paths["fast"])[0].times[-1] == 199
+
+
+def test_other_logs_have_the_unit_of_an_angle_that_the_run_found(tmp_path):
+    wide = {"time": 0.02 * np.arange(200), "yaw": 7.0 * np.arange(200) % 360}
+    narrow = {"time": 0.02 * np.arange(200), "yaw": np.sin(np.arange(200))}
+    (tmp_path / "reader.json").write_text(
+        '{"angles": ["yaw"], "found": {"time_unit": "s", "units": {"yaw": "deg"}}}'
+    )
+    for name, columns in (("wide", wide), ("narrow", narrow)):
+        dataset = read_log(tables.write_csv(tmp_path / name, columns), None, run=tmp_path)
+        assert dataset.units == ("deg",)

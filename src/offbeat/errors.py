@@ -54,6 +54,7 @@ class DivergenceError(OffbeatError, ArithmeticError):
 
 
 _MOST_LISTED, _MOST_COMPARED = 50, 2000  # choices in a message
+_LONGEST_SHOWN = 100  # characters of what was given
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -88,4 +89,7 @@ def one_of(what: str, got: str, choices: Iterable[str]) -> str:
     hint = f"; did you mean {near[0]!r}?" if near else ""
     more = f" and {len(known) - _MOST_LISTED} more" if len(known) > _MOST_LISTED else ""
     shown = ", ".join(known[:_MOST_LISTED]) + more
-    raise InputError(f"unknown {what} {got!r}, expected one of: {shown}{hint}")
+    given = repr(got)
+    if len(given) > _LONGEST_SHOWN:
+        given = f"{given[:_LONGEST_SHOWN]}..."
+    raise InputError(f"unknown {what} {given}, expected one of: {shown}{hint}")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,50 +38,121 @@ def writable(path: str | Path, *, folder: bool = False) -> Path:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yields a temporary name in the folder of `path`; renames it to `path` if the block succeeds.
 
-    If the block raises or the process is killed, `path` does not change.
+    If the block raises or the process is killed, `path` does not change. What a killed process
+    left is removed by the next one that writes `path`.
     """
     path = writable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        _settle(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    _remove_left(path)
+    with _named(path):
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=f".{path.name}.", suffix=path.suffix
+        )
+        temporary = Path(name)
+        try:
+            _lock(handle)
+            yield temporary
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o666 & ~umask)
+            _settle(temporary)
+            os.replace(temporary, path)
+        finally:
+            os.close(handle)
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yields a temporary folder next to `path`; renames it to `path` if the block succeeds.
 
-    A folder at `path` is replaced after the new one is complete.
+    A folder at `path` is replaced after the new one is complete. What a killed process left is
+    removed, or put back, by the next one that writes `path`.
     """
     path = writable(path, folder=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    _remove_left(path)
+    with _named(path):
+        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+        handle = os.open(temporary, os.O_RDONLY)
+        try:
+            _lock(handle)
+            yield temporary
+            for file in temporary.rglob("*"):
+                if file.is_file():
+                    _settle(file)
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o777 & ~umask)
+            if path.exists():
+                old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
+                os.replace(path, old)
+                os.replace(temporary, path)
+                shutil.rmtree(old)
+            else:
+                os.replace(temporary, path)
+        finally:
+            os.close(handle)
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+_LEFT_S = 60.0
+"""Age from which a temporary file that no process holds is one that a killed process left."""
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Adds the path to errors such as a full disk, which name no file."""
     try:
-        yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                _settle(file)
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o777 & ~umask)
-        if path.exists():
-            old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
-            os.replace(path, old)
-            os.replace(temporary, path)
-            shutil.rmtree(old)
-        else:
-            os.replace(temporary, path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+
+
+def _lock(handle: int) -> bool:
+    """Locks an open file for this process; False if another one has it."""
+    try:
+        import fcntl
+    except ImportError:  # not on this system: nothing is ever removed there
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def _remove_left(path: Path) -> None:
+    """Removes temporary files and folders for `path` that killed processes left.
+
+    A folder that was moved away and not replaced is put back.
+    """
+    pattern = re.compile(
+        rf"\.{re.escape(path.name)}\.(old\.)?[a-z0-9_]{{8}}({re.escape(path.suffix)})?"
+    )
+    with os.scandir(path.parent) as entries:
+        names = [entry.name for entry in entries if pattern.fullmatch(entry.name)]
+    for name in names:
+        left = path.parent / name
+        try:
+            if time.time() - left.stat().st_mtime < _LEFT_S:
+                continue
+            handle = os.open(left, os.O_RDONLY)
+        except OSError:
+            continue
+        try:
+            if not _lock(handle):
+                continue
+            if left.is_dir() and ".old." in name and not path.exists():
+                os.replace(left, path)
+            elif left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+        finally:
+            os.close(handle)
 
 
 def _settle(path: Path) -> None:

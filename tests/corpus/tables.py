@@ -179,6 +179,15 @@ KINDS: dict[str, Kind] = {
         {"GyrX[3]": X, "AccZ[3]": [-9.8] * ROWS, "GyrX[7]": Y, "AccZ[7]": [-10.8] * ROWS},
         options={"instance_column": "unit"},
     ),
+    "a column of modes": Kind(
+        {"time": TIMES, "name": ["idle"] * 20 + ["run"] * 20, **XY}, XY, note="'name'"
+    ),
+    "a date with its time of day": Kind({"Date": texts(NS, "%Y-%m-%d %H:%M:%S"), **XY}, XY),
+    "an empty stamp beside the time": Kind(
+        {"rosbagTimestamp": NS, "stamp": [None] * ROWS, **XY},
+        {"stamp": [np.nan] * ROWS, **XY},
+        formats=("csv", "parquet"),
+    ),
     "channels called signal and value": Kind(
         {"time": TIMES, "signal": X, "value": Y}, {"signal": X, "value": Y}
     ),

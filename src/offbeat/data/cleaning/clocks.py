@@ -48,7 +48,7 @@ TIME_NAMES = (
     *(f"{stem}_{unit}" for stem in _LONG for unit in ("min", "h", "d")),
     *("times", "timestamps", "time_stamp", "datetime", "date_time", "elapsed", "elapsed_time"),
     *("rosbag_timestamp", "ros_time", "header_stamp", "field_header_stamp", "log_time"),
-    *("epoch", "unix_time", "unixtime", "utc", "utc_time", "sec", "secs", "seconds"),
+    *("epoch", "unix_time", "unixtime", "utc", "utc_time", "sec", "secs", "seconds", "ts"),
 )
 """Names of time columns, in any case; the first one in a file is used. Names with a
 unit give the unit, as do units in brackets, as in `t [ns]` and `Time (ms)`. A point, a blank or a

@@ -288,12 +288,18 @@ def stamp_columns(
         )
     if options.rate_hz is not None:
         return made("", note=f"stamps are row number / {options.rate_hz:g} Hz, as rate_hz says")
-    time = time_column_of(names)
+    time, left = time_column_of(names), names
+    while time is not None and (found := sample.texts(time)) and not any(found):
+        left = [name for name in left if name != time]  # one that is never known is not the time
+        time = time_column_of(left)
+    time = time or time_column_of(names)
+    dates = [name for name in names if folded(name) in _DATES and _is_date(sample, name)]
+    if time is None and dates:
+        return made(dates[0])
     if time is not None:
         for one, two, unit in pairs:
             if time in (one, two):
                 return joined(one, two, unit)
-        dates = [name for name in names if folded(name) in _DATES and _is_date(sample, name)]
         if dates and sample.is_text(time) and not _is_date(sample, time):
             return joined(dates[0], time, "date")
         return made(time)
@@ -380,6 +386,15 @@ def _long_form(
     return key, value
 
 
+def _take_turns(stamp: Columns, keys: list[str], sample: Sample) -> bool:
+    """Whether rows of several keys take turns, or share stamps, unlike those of a mode."""
+    changes = [i for i in range(1, len(keys)) if keys[i] != keys[i - 1]]
+    if 4 * len(changes) >= len(keys):
+        return True
+    times = sample.numbers(stamp.time) if stamp.time else np.zeros(0)
+    return len(times) == len(keys) and any(times[i] <= times[i - 1] for i in changes)
+
+
 def _instance_column(
     stamp: Columns, rest: list[str], options: TableOptions, sample: Sample
 ) -> str | None:
@@ -396,8 +411,9 @@ def _instance_column(
         usual = name.casefold()
         if usual in KEY_NAMES and sample.is_text(name):
             texts = sample.texts(name)
-            different = set(texts) - {""}
-            if 1 < len(different) <= min(_MOST_INSTANCES, len(texts) // 2) and "" not in texts:
+            different = set(texts)
+            few = 1 < len(different) <= min(_MOST_INSTANCES, len(texts) // 2)
+            if few and "" not in different and _take_turns(stamp, texts, sample):
                 return name
         elif usual in INSTANCE_NAMES and not sample.is_text(name):
             numbers = sample.numbers(name)

@@ -24,20 +24,24 @@ _NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$|^[+-]?(inf|infin
 _INFINITE = r"^([+-]?)1\.#(INF|inf).*$"
 _THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
 _GROUPED_BY_POINTS = re.compile(r"[+-]?[1-9][0-9]{0,2}(\.[0-9]{3})+,[0-9]+")
-_IS_NUMBER = re.compile(_NUMBER, re.IGNORECASE)
+_GROUPED_BY_COMMAS = re.compile(_THOUSANDS)
 
 
 def number_in(text: str, decimal: str) -> float | None:
     """The number in a field, or None."""
-    text = text.strip()
     if decimal != ".":
-        if _GROUPED_BY_POINTS.fullmatch(text):
+        if _GROUPED_BY_POINTS.fullmatch(text.strip()):
             text = text.replace(".", "")
         text = text.replace(".", "?").replace(decimal, ".")
-    elif re.fullmatch(_THOUSANDS[1:-1], text):
+    elif "," in text and _GROUPED_BY_COMMAS.fullmatch(text.strip()):
         text = text.replace(",", "")
+    try:
+        number = float(text)
+    except ValueError:
+        infinite = re.match(_INFINITE, text.strip())
+        return float(f"{infinite[1]}inf") if infinite else None
     # Python allows _ between digits, and digits of other scripts; CSV does not.
-    return float(text) if _IS_NUMBER.match(text) else None
+    return number if text.isascii() and "_" not in text else None
 
 
 @dataclass

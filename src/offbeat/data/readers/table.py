@@ -7,7 +7,7 @@ import re
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +200,7 @@ class _CsvFile:
     missing: tuple[str, ...]
     notes: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)  # rows with another number of fields
+    repeated: str = ""  # header that stands in the middle, too
 
     @property
     def path(self) -> Path:
@@ -320,6 +321,13 @@ class _CsvFile:
                 table = gather(batches, columns, lines)
             except (pa.ArrowException, OverflowError) as error:
                 again = self._next(str(error), header, columns, clock, attempts, numbers_only)
+                if not again and not self.repeated and (repeated := self._header_again()):
+                    file = replace(self, repeated=repeated)
+                    file.notes.append(
+                        "the header stands again in the middle, as in logs that are joined; those "
+                        "lines are left out"
+                    )
+                    return file.columns(header, sample, columns, unit, rate_hz)
                 if not again:
                     self._explain(header, columns, sample)
                     raise line_error(self.path, error) from None
@@ -411,7 +419,17 @@ class _CsvFile:
 
     def _stream(self) -> Any:
         file = self.text.bytes_from(self.layout.first)
+        if self.repeated:
+            return _Without(file, self.repeated.encode())
         return file if self.layout.delimiter != " " else _Spaced(file)
+
+    def _header_again(self) -> str:
+        """The line of the header, if there is another such line; else an empty text."""
+        if not self.layout.line or self.layout.delimiter == " ":
+            return ""
+        lines = (line.strip() for line in self.text.lines())
+        header = next(itertools.islice(lines, self.layout.line - 1, None), "")
+        return header if header in lines else ""
 
     def _on_odd_row(self, row: Any) -> str:
         """Skips comments and, provisionally, one row with another number of fields."""
@@ -502,6 +520,10 @@ class _CsvFile:
             f"{self.path} has {got[:60]!r} in line {line}, column {name!r}, expected {expected}"
         )
 
+    @property
+    def _fields_of_header(self) -> list[str]:
+        return [field.strip() for field in self.repeated.split(self.layout.delimiter)]
+
     def _count_lines(self) -> int:
         """Number of lines from the first row on, an upper bound of the number of rows."""
         ends = returns = 0
@@ -572,6 +594,8 @@ class _CsvFile:
         """Line numbers and fields of the rows, without comments."""
         for line, fields in self.text.rows(self.layout.delimiter):
             odd = len(fields) != len(self.layout.names)
+            if self.repeated and [f.strip() for f in fields] == self._fields_of_header:
+                continue
             if line >= self.layout.first and not (odd and is_comment(fields[0])):
                 yield line, fields
 
@@ -617,6 +641,24 @@ def _without_last(table: Gathered) -> Gathered:
         for coded in (table.labels, table.keys)
     )
     return Gathered(table.clock[:-1], labels, keys, table.values[:-1])
+
+
+class _Without:
+    """A stream of text without some line."""
+
+    closed = False
+
+    def __init__(self, file: Any, line: bytes) -> None:
+        self.file, self.line = file, line
+
+    def read(self, size: int = -1) -> bytes:
+        while lines := self.file.readlines(size if size > 0 else -1):
+            if text := b"".join(line for line in lines if line.strip() != self.line):
+                return text
+        return b""
+
+    def close(self) -> None:
+        self.file.close()
 
 
 class _Spaced:
