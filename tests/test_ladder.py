@@ -49,7 +49,7 @@ def test_a_ladder_that_was_stopped_ends_as_if_it_had_not_been(tmp_path, monkeypa
     def killed(*args, **kwargs):
         nonlocal steps
         steps += 1
-        if steps == 2 * 2 * 8 + 8:  # two epochs each of timing, then within the second trial
+        if steps == 2 * 3 * 16 + 8:  # three epochs each of timing, then within the trials
             raise Killed
         return step(*args, **kwargs)
 
@@ -72,10 +72,10 @@ def test_a_budget_leaves_out_the_last_candidates_and_bounds_the_epochs(tmp_path,
 
     monkeypatch.setattr(_Ladder, "_seconds_per_step", lambda self, candidate: 1.0)
     ladder = _Ladder(TRAIN, VALIDATION, CONFIG, "standardise", None, 0, None, False)
-    # An epoch is three steps, of 1.5 s with what is around them.
-    trials, epochs = ladder.plan(CANDIDATES, 2 * 4.5 * 5, None)
+    # An epoch is three steps, of 1.2 s with what is around them.
+    trials, epochs = ladder.plan(CANDIDATES, 2 * 3.6 * 5.5, None)
     assert (len(trials), epochs, trials[0].epochs) == (2, 2, 6)
-    trials, epochs = ladder.plan(CANDIDATES, 2 * 4.5 * 12, None)
+    trials, epochs = ladder.plan(CANDIDATES, 2 * 3.6 * 12.5, None)
     assert (len(trials), epochs, trials[0].epochs) == (3, 4, 12)
     trials, epochs = ladder.plan(CANDIDATES, 1e-3, None)
     assert (len(trials), epochs, trials[0].epochs) == (1, 2, 6)
