@@ -176,6 +176,8 @@ def test_a_filter_is_the_dense_posterior_of_the_observations_before(order, chann
                         expected, rel=tolerance(noise)
                     )
                     expected = (cov[row, j, j] + noise[j]) * 4.0 * unit**2
+                    if row == 0 and j == 0:  # nothing was observed
+                        expected = unit**2
                     found = variances[j][batch, chain]
                     assert found == pytest.approx(expected, rel=tolerance(noise))
         mask = data.observed[:, row]
@@ -342,3 +344,32 @@ def test_channels_of_very_different_scale_are_fitted_alike():
         )
         assert scaled.banks[0].damping == pytest.approx(plain.banks[0].damping, rel=1e-6)
         assert scaled.banks[0].drive == pytest.approx(plain.banks[0].drive, rel=1e-6)
+
+
+def degenerate():
+    """Data that tell little, by name."""
+    random = np.random.default_rng(0)
+    times = np.arange(50) * 0.01
+    waves = np.stack([np.sin(9 * times), np.cos(9 * times)], axis=1)
+    some = np.repeat((times % 0.1 < 0.06)[:, None], 2, axis=1)
+    never = np.array([False, True]) & some
+    spike = np.where((times == 0.2)[:, None], [-999.0, 1.0], waves)
+    yield "one row", times[:1], waves[:1], some[:1]
+    yield "three rows", times[:3], random.normal(size=(3, 2)), some[:3]
+    yield "a constant", times, np.where([True, False], 7.0, waves), some
+    yield "a channel that is never observed", times, waves, never
+    yield "a channel that is never known", times, np.where([True, False], np.nan, waves), never
+    yield "units of extreme size", times * 1e9, waves * [1e30, 1e-30], some
+    yield "a sentinel", times, spike, some
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["kalman_short", "smoother", "motion_filter", "motion_smoother"])
+def test_data_that_tell_little_give_finite_predictions(name):
+    for what, times, values, observed in degenerate():
+        data = ob.Dataset((ob.Trajectory(times, values, observed=observed),))
+        fitted = fit_baseline(name, data)
+        assert np.isfinite(fitted.predict(data)[0]).all(), what
+        assert np.isfinite(np.concatenate([a.ravel() for a in fitted.arrays().values()])).all(), (
+            what
+        )

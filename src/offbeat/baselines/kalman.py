@@ -263,14 +263,20 @@ class Chains:
         return self.in_units(belief.mean, [state[f"seen{i}"] for i in range(self.order)])
 
     def read_variance(self, state: State, time: Any) -> list[Any]:
-        """(..., chains) per state: variance of a measurement, in squared units of the channels."""
+        """(..., chains) per state: variance of a measurement, in squared units of the channels.
+
+        That of a position that was not observed yet is the square of its unit.
+        """
+        xp = namespace(state["time"])
         cov = self.moved(state, time).cov
         like = state["time"]
-        return [
-            (cov[i, i] + self._like(self.noise[i], like))
-            * self._like(self.variance * self.unit[:, i] ** 2, like)
+        unit = [self._like(self.unit[:, i] ** 2, like) for i in range(self.order)]
+        variance = self._like(self.variance, like)
+        found = [
+            (cov[i, i] + self._like(self.noise[i], like)) * variance * unit[i]
             for i in range(self.order)
         ]
+        return [xp.where(state["seen0"] > 0, found[0], unit[0]), *found[1:]]
 
     def moved(self, state: State, time: Any) -> Belief:
         """The belief at a time after the last observation; before the first one, the prior."""

@@ -243,7 +243,7 @@ class ChainFilter(ChainBaseline, CausalBaseline):
     def read_variance(self, state: State, time: Any) -> Any:
         """Variance of what a sensor will measure; see `read`.
 
-        Before the first observation it is that of the prior, which is all but infinite.
+        Before the first observation of a position, it is the variance of training.
 
         Returns:
             (batch, channels) in squared units of the channels.
