@@ -28,7 +28,8 @@ def serve(
     """Answers every line of a file descriptor on another one, each as soon as it arrives.
 
     Returns when the input ends, and on SIGTERM or SIGINT after answering what had arrived; a second
-    signal has its usual effect. A last line without a newline is a line.
+    signal has its usual effect. A last line without a newline is a line where the input ends there;
+    after a signal it is one of which a part has arrived, and has no answer.
 
     Args:
         answer: from a line without its newline to its answer, which may be empty.
@@ -53,11 +54,16 @@ def serve(
                 elif len(rest) > LONGEST_LINE:
                     _write(sink, refuse(f"a line is longer than {LONGEST_LINE} bytes"))
                     rest, skipping = b"", True
-            if rest:
+            if rest and not _is_readable(stop):
                 _write(sink, _one(answer, refuse, rest))
         except BrokenPipeError:
             return False
     return True
+
+
+def _is_readable(descriptor: int) -> bool:
+    ready, _, _ = select.select([descriptor], [], [], 0)
+    return bool(ready)
 
 
 def _one(answer: Callable[[bytes], bytes], refuse: Callable[[str], bytes], line: bytes) -> bytes:
