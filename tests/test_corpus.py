@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
+
 import fuzz
 import h5py
 import numpy as np
@@ -79,6 +83,28 @@ def test_a_text_file_is_read_in_the_form_it_has(name, tmp_path):
     assert trajectory.values.tolist() == np.column_stack([tables.X, tables.Y]).tolist()
     assert note in notes(dataset)
     assert dataset.units == (("m", "deg") if "units" in name else ("", ""))
+
+
+@pytest.mark.parametrize(("suffix", "pack"), [("gz", gzip), ("bz2", bz2), ("xz", lzma)])
+def test_a_compressed_text_has_a_suffix_more(suffix, pack, tmp_path):
+    path = tmp_path / f"log.csv.{suffix}"
+    packed = pack.compress(("time,x,y\n" + tables.BODY).encode())
+    path.write_bytes(packed)
+    dataset = read(path)
+    assert dataset[0].values[:, 0].tolist() == tables.X.tolist()
+    assert read(tmp_path).fingerprint() == dataset.fingerprint()
+    path.write_bytes(packed[: len(packed) - 12])
+    if suffix == "gz":  # the others hold a single block
+        rest = read(path)
+        assert 0 < rest[0].rows <= tables.ROWS
+        assert "compressed data end early" in notes(rest)
+
+
+@pytest.mark.parametrize("name", ["a.db3.zstd", "a.bag.gz", "a.zip", "a.parquet.zst", "a.tar"])
+def test_another_compressed_file_is_not_called_damaged(name, tmp_path):
+    (tmp_path / name).write_bytes(b"\x28\xb5\x2f\xfd")
+    with pytest.raises(FileFormatError, match=r"is compressed or an archive.*unpack it with: "):
+        read(tmp_path / name)
 
 
 def test_logs_that_are_joined_are_an_episode_each(tmp_path):

@@ -15,6 +15,7 @@ from real_logs import evo, shared
 
 from offbeat.data.readers import OPTIONS as CLEANING
 from offbeat.data.readers import READERS, read
+from offbeat.data.recording import ReaderOptions, Recording, Signal, assemble
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError
 
@@ -169,6 +170,15 @@ def test_a_channel_can_be_left_out(variant, log):
     rest = read_back(variant, log, without=[left])
     assert rest.names == dataset.names[1:]
     assert rest[0].values.tobytes() == dataset[0].values[:, 1:].tobytes()
+
+
+def test_all_channels_of_one_field_can_be_left_out():
+    names = ("q[0]", "q[1]", "pose.x", "pose.y", "posed")
+    signal = Signal("", np.arange(3), np.zeros((3, 5)), names)
+    for without, left in ((["q"], names[2:]), (["pose"], (*names[:2], "posed"))):
+        assert assemble([Recording((signal,))], ReaderOptions(without=without)).names == left
+    with pytest.raises(InputError, match="unknown channel in without 'po'"):
+        assemble([Recording((signal,))], ReaderOptions(without=["po"]))
 
 
 def test_a_git_lfs_pointer_is_called_one(variant, log):

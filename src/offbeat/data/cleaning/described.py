@@ -95,10 +95,12 @@ class Channels:
                 degrees[name] = _is_in_degrees(name, columns, at, recordings)
                 units[at] = "deg" if degrees[name] else ""
         gone = {name for recording in recordings for name in recording.left_out}
-        left_out = {
-            name for name in options.without
-            if name in place or (name not in gone and one_of("channel in without", name, names))
-        }  # fmt: skip
+        left_out: set[str] = set()
+        for name in options.without:
+            inside = [n for n in names if n == name or n.startswith((f"{name}.", f"{name}["))]
+            if not inside and name not in gone:
+                one_of("channel in without", name, names)
+            left_out.update(inside)
         chosen = tuple(name for name in options.channels or names if name not in left_out)
         if not chosen:
             raise InputError(

@@ -22,7 +22,8 @@ class ReaderOptions:
     Attributes:
         channels: names of the channels to keep, as in a data set of all channels, in this
             order; None keeps all. Rows in which none of them was logged are not read.
-        without: names of channels to leave out.
+        without: names of channels to leave out, or of what several belong to: `pose` leaves out
+            `pose.position.x`, and `q` leaves out `q[0]`.
         actions: names of channels to give the role `action`, in addition to those that the format
             marks. An action applies until the next logged one, and its values are not cleaned.
         exogenous: names of channels to give the role `exogenous`.

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from offbeat.data import store
-from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, ulog
+from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, text, ulog
 from offbeat.data.readers.folders import FILES, check_paths, files_in, together
 from offbeat.data.readers.options import check_types
 from offbeat.data.recording import ReaderOptions, Recording, assemble
@@ -23,6 +23,20 @@ from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import FileFormatError, InputError, OffbeatError, one_of, printable
 from offbeat.registry import Registry
+
+PACKED = {
+    ".gz": "gunzip",
+    ".bz2": "bunzip2",
+    ".xz": "unxz",
+    ".zst": "zstd -d",
+    ".zstd": "zstd -d",
+    ".lz4": "unlz4",
+    ".zip": "unzip",
+    ".7z": "7z x",
+    ".tar": "tar xf",
+    ".tgz": "tar xf",
+}
+"""Suffixes of compressed files and archives, each with the command that unpacks it."""
 
 FOLDER = "/"
 """The suffix for readers of folders, which must have `recognises`."""
@@ -286,6 +300,14 @@ def reader_of(path: Path) -> Reader:
         FileFormatError: no reader supports it.
     """
     suffix = FOLDER if path.is_dir() else path.suffix.lower()
+    if suffix in PACKED:
+        inner = Path(path.stem).suffix.lower()
+        if suffix in text.COMPRESSED and inner in READERS["csv"].suffixes:
+            return READERS["csv"]
+        raise FileFormatError(
+            f"{path} is compressed or an archive, which is read of text alone ("
+            f"{', '.join(f'.csv{s}' for s in text.COMPRESSED)}); unpack it with: {PACKED[suffix]}"
+        )
     fitting = [reader for reader in READERS.values() if suffix in reader.suffixes]
     for reader in fitting:
         if reader.recognises is not None and reader.recognises(path):

@@ -204,6 +204,8 @@ class Columns:
                         f"{_first(sample.texts(column))!r}, expected numbers; choose other columns "
                         "with channels="
                     )
+            asked = set(kept)
+            left = [column for column in columns if column not in asked]
         else:
             without = {column_of[name] for name in options.without if name in column_of}
             texts = [c for c in columns if c not in without and sample.is_text(c)]

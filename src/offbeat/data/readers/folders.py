@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from offbeat.data.readers.text import COMPRESSED
 from offbeat.data.signals import Recording
 from offbeat.errors import FileFormatError, InputError
 
@@ -25,7 +26,12 @@ def files_in(folder: Path, suffixes: Iterable[str]) -> list[Path]:
     known = set(suffixes)
     found: list[Path] = []
     for path in folder.iterdir():
-        if path.suffix.lower() in known and not path.name.startswith(".") and path.is_file():
+        inner = Path(path.stem).suffix.lower() if path.suffix.lower() in COMPRESSED else ""
+        if (
+            {path.suffix.lower(), inner} & known
+            and not path.name.startswith(".")
+            and path.is_file()
+        ):
             found.append(path)
             if len(found) > _MOST_FILES:
                 raise FileFormatError(f"{folder} holds more than {_MOST_FILES} files")

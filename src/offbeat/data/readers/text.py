@@ -20,6 +20,9 @@ from offbeat.errors import FileFormatError
 LONGEST_LINE = 1 << 24
 """Characters of a line; a longer one is refused before it is read to its end."""
 
+COMPRESSED = (".gz", ".bz2", ".xz")
+"""Suffixes after that of a text file which is compressed; the content alone decides."""
+
 _BLOCK = 1 << 20
 _START = 1 << 16  # bytes from which the encoding is derived
 _OPENERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open}
@@ -172,7 +175,7 @@ class _UpToTheCut(io.RawIOBase):
 
     def readinto(self, buffer: Any) -> int:
         try:
-            part = self.file.read(len(buffer))
+            part = self.file.read1(len(buffer))  # type: ignore[attr-defined]
         except DAMAGE as error:
             if not self.started:
                 raise
