@@ -58,7 +58,9 @@ def offbeat_step(config: ob.ModelConfig, data: ob.Dataset, backend: str) -> Step
 
 def steps_of(name: str, data: ob.Dataset) -> dict[str, Step]:
     """The implementations that can run a model here."""
-    config = ob.thesis_config(name) if name in ob.THESIS_MODELS else ob.ModelConfig(name=name)
+    config = ob.ModelConfig(name=name, nodes="rows", bounded=False)  # as the peers
+    if name in ob.THESIS_MODELS:
+        config = ob.thesis_config(name)
     model = ob.make_model(config, data, seed=0)
     batch = model.batch(data)
     rows, _ = model.step_inputs(batch)

@@ -94,8 +94,8 @@ void bind(nb::module_& m, const char* suffix) {
             // The last quantities belong to nodes, and may be left out.
             in_range("the number of places", int64_t(places.size()), FIRST_NODE, QUANTITIES);
             places.resize(QUANTITIES);
-            new (self) StepInputs<T>{
-                {}, low, high, mean, use_prediction, length, table, index, places, rows};
+            new (self) StepInputs<T>{{},     low,   high,  mean,   use_prediction,
+                                     length, table, index, places, rows};
           },
           nb::arg("table").noconvert(), nb::arg("index").noconvert(), nb::arg("places"),
           nb::arg("rows"), nb::arg("mean").noconvert().none(),
@@ -193,8 +193,9 @@ NB_MODULE(_cpu, m) {
           },
           nb::arg("channels"), nb::arg("hidden"), nb::arg("anchored"), nb::arg("time_inputs"),
           nb::arg("cell"), nb::arg("reset_after"), nb::arg("field"), nb::arg("activation"),
-          nb::arg("a"), nb::arg("b"), nb::arg("steps"), nb::arg("max_step"), nb::arg("nodes") = false,
-          nb::arg("decay_span") = 1.0, nb::arg("bounded") = false, nb::arg("decay_features"), nb::arg("decay_rows"), nb::arg("input_decay"),
+          nb::arg("a"), nb::arg("b"), nb::arg("steps"), nb::arg("max_step"),
+          nb::arg("nodes") = false, nb::arg("decay_span") = 1.0, nb::arg("bounded") = false,
+          nb::arg("decay_features"), nb::arg("decay_rows"), nb::arg("input_decay"),
           nb::arg("decoder"))
       .def_prop_ro("flat_size", [](const Spec& s) { return flat_size(s); })
       .def_prop_ro("state_size", [](const Spec& s) { return state_of(s); });

@@ -14,7 +14,8 @@ struct TimeSettings {  // how a model reads time; units and limits in s
   bool exponential = false;  // the decay depends on the elapsed time, not on delta
 };
 
-// kernels/spec.py: nodes_before. The number of the last node before a time, and the time since then.
+// kernels/spec.py: nodes_before. The number of the last node before a time, and the time since
+// then.
 double node_before(double time, double& rest) {
   time = std::min(time, double(MOST_NODES));
   const double node = std::floor(time + 1e-6);
@@ -70,7 +71,8 @@ class StreamEngine {
     first_.last = mean_;
     first_.channel_at.assign(C, -INFINITY);
     now_ = first_;
-    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &last_, &out_}) v->assign(C, T(0));
+    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &last_, &out_})
+      v->assign(C, T(0));
     time_input_.assign(std::max(spec.time_inputs, 1), T(0));
     before_.assign(S, T(0));
     after_.assign(S, T(0));
@@ -261,9 +263,10 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
           "__init__",
           [](StreamEngine<T>* self, const Spec& spec, const std::string& set, Const<T> weights,
              Const<T> mean, Const<T> std, const std::vector<int64_t>& decoder,
-             Maybe<T> decoder_weights, Const<T> first_state, Maybe<T> low, Maybe<T> high, double unit, double time_input_unit,
-             double elapsed_limit, double longest_delta, int64_t time_input, bool from_first_row,
-             bool last_row, bool every_row, bool starts_only, bool exponential) {
+             Maybe<T> decoder_weights, Const<T> first_state, Maybe<T> low, Maybe<T> high,
+             double unit, double time_input_unit, double elapsed_limit, double longest_delta,
+             int64_t time_input, bool from_first_row, bool last_row, bool every_row,
+             bool starts_only, bool exponential) {
             TimeSettings c;
             c.unit = unit, c.time_input_unit = time_input_unit, c.elapsed_limit = elapsed_limit;
             c.longest_delta = longest_delta, c.time_input = time_input,
@@ -276,7 +279,8 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
           nb::arg("spec"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
           nb::arg("mean").noconvert(), nb::arg("std").noconvert(), nb::arg("decoder"),
           nb::arg("decoder_weights").noconvert().none(), nb::arg("first_state").noconvert(),
-          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none(), nb::arg("unit"), nb::arg("time_input_unit"), nb::arg("elapsed_limit"),
+          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none(),
+          nb::arg("unit"), nb::arg("time_input_unit"), nb::arg("elapsed_limit"),
           nb::arg("longest_delta"), nb::arg("time_input"), nb::arg("from_first_row"),
           nb::arg("last_row"), nb::arg("every_row"), nb::arg("starts_only"), nb::arg("exponential"))
       .def("reset", &StreamEngine<T>::reset)

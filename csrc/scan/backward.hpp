@@ -116,8 +116,7 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
   // Dynamics and decay, last step first.
   Steps<P> p = steps_to_row<P>(s, f);
   auto reach_node = [&] {
-    P::each(d.S,
-            [&](int64_t i, int) { store<T>(g + i, load<T>(g + i) + load<T>(k.to_node + i)); });
+    P::each(d.S, [&](int64_t i, int) { store<T>(g + i, load<T>(g + i) + load<T>(k.to_node + i)); });
   };
   const bool one_shot = !s.field.layers || (s.steps == 1 && s.max_step == 0);
   T* to_start = to(k.places.start);
@@ -150,13 +149,10 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
       const V bounded = clip(e.reached), gamma = load<T>(factor + i), gradient = load<T>(gh + i);
       store<T>(gh + i, gradient * gamma);
       V to_growth = -gamma * gradient * load<T>(arrived + i);
-      if (s.field.layers || s.nodes)
-        to_growth = bounded - e.before >= T(0) ? to_growth : splat(0);
+      if (s.field.layers || s.nodes) to_growth = bounded - e.before >= T(0) ? to_growth : splat(0);
       // The applied exponent is the larger of the two; a tie splits the gradient.
       const V to_applied = load<T>(to_before + i);
-      V slope = bounded > e.before    ? splat(1)
-                : bounded == e.before ? splat(T(0.5))
-                                      : splat(0);
+      V slope = bounded > e.before ? splat(1) : bounded == e.before ? splat(T(0.5)) : splat(0);
       if (s.nodes) {
         const V active = load<T>(p.active + lane);
         slope = active != T(0) ? slope : splat(0);
@@ -170,8 +166,7 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
       if (q == p.untracked && s.decay_rows == CONTINUOUS) {
         const V began = s.nodes ? fma(e.began, last - first, first) : first;
         V to_began = e.fresh != T(0) ? splat(0) : to_previous * inside(began);
-        if (p.untracked)
-          to_began = load<T>(p.later + lane) >= T(p.untracked) ? to_began : splat(0);
+        if (p.untracked) to_began = load<T>(p.later + lane) >= T(p.untracked) ? to_began : splat(0);
         start = start + (1 - e.began) * to_began;
         end = end + e.began * to_began;
       }
@@ -261,8 +256,7 @@ static NOINLINE void runge_kutta_backward(Back<P>& k, const T* span, T* g, const
     if (s.bounded)
       P::each_unit(driven, [&](int64_t i, int, int n) {
         T* own_stage = to_stage + j * size + i;
-        store<T>(own_stage, load<T>(own_stage) * inside(load<T>(stage + i),
-                                                        P::constant(c.low, n),
+        store<T>(own_stage, load<T>(own_stage) * inside(load<T>(stage + i), P::constant(c.low, n),
                                                         P::constant(c.high, n)));
       });
   }
@@ -288,8 +282,7 @@ static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
                           int64_t(gradient_layout(s, d, max_steps).size) * P::W;
   return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W +
          int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * (s.stages + 1) + d.S) * P::W +
-         range_size(s, d) +
-         int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
+         range_size(s, d) + int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
 }
 
 template <class P>

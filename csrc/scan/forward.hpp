@@ -106,7 +106,8 @@ static INLINE Exponent exponent(const Spec& s, int step, bool one_shot, V first,
   if (step)
     e.before = load<T>(previous);
   else
-    e.before = e.fresh != T(0) ? splat(0) : clip(s.nodes ? fma(e.began, last - first, first) : first);
+    e.before =
+        e.fresh != T(0) ? splat(0) : clip(s.nodes ? fma(e.began, last - first, first) : first);
   if (s.nodes) {
     e.fraction = load<T>(p.fraction + lane);
     e.reached = fma(e.fraction, last - first, first);
@@ -149,8 +150,8 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
       });
     } else if (s.bounded && d.A) {
       P::each_unit(d.C, [&](int64_t i, int, int k) {
-        store<T>(u + i, within(load<T>(f.values + i), P::constant(c.low, k),
-                               P::constant(c.high, k)));
+        store<T>(u + i,
+                 within(load<T>(f.values + i), P::constant(c.low, k), P::constant(c.high, k)));
       });
     } else {
       copy<P>(d.C, f.values, u);

@@ -54,7 +54,8 @@ static Net net(const Perceptron& shape) {
 template <class P>
 struct Layout {
   int64_t u, start, end, before, node, gate, inner, innovation, decoded, h_before;
-  int64_t decoder, step, step_size, applied, factor, arrived, limited, stage, stage_size, y, network, size;
+  int64_t decoder, step, step_size, applied, factor, arrived, limited, stage, stage_size, y,
+      network, size;
   Net field_net, decoder_net;
   int64_t x_at, h_at, c_at, state;  // inside a state
 };
@@ -108,7 +109,8 @@ static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
 // The step inputs of one row for the lanes of a block. A lane past its last row keeps its state.
 template <class P>
 struct RowInputs {
-  T *gap, *update, *updated, *valid, *first, *node, *commit, *values, *mask, *time_input, *start, *end, *delta, *last;
+  T *gap, *update, *updated, *valid, *first, *node, *commit, *values, *mask, *time_input, *start,
+      *end, *delta, *last;
   const T* mean;
   T* zeros;  // inputs of a lane past its last row
   bool active = false, use_prediction = false;
@@ -207,8 +209,8 @@ struct Context {
   const T* packed;
   const T* input_decay;  // weights, then biases
   Layout<P> l;
-  T* work;           // scratch: a layer, then the slopes of the stages
-  int lanes = P::W;  // lanes in use; the others are padding
+  T* work;                                  // scratch: a layer, then the slopes of the stages
+  int lanes = P::W;                         // lanes in use; the others are padding
   const T *low = nullptr, *high = nullptr;  // of the driven units of a bounded scan
 };
 

@@ -53,8 +53,9 @@ static void stream_row(const StreamRow<T>& row) {
   T* work = take(work_size<One>(s));
   T* limits = take(range_size(s, d));
   range<One>(s, d, row.low, row.high, limits);
-  const Context<One> c{s, p,      row.packed, row.packed + p.stream - 2 * up(d.C, VW), l, work,
-                       1, limits, limits + l.network};
+  const Context<One> c{
+      s, p,      row.packed,        row.packed + p.stream - 2 * up(d.C, VW), l, work,
+      1, limits, limits + l.network};
   const int64_t place[3] = {0, l.h_at, l.c_at}, width[3] = {d.A, d.H, d.lstm ? d.H : 0};
   auto unpadded = [&](const T* from, T* to) {
     for (int k = 0; k < 3; ++k)

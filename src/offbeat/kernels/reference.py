@@ -286,6 +286,7 @@ class _Nodes:
         last: per row (batch, 1) the number of the last node before the row.
         rest: per row (batch, 1) model time from there to the row.
         whole: per row the largest number of steps from node to node.
+        read: per row whether a step from the last node to the row is needed.
         commit: per row (batch, 1) True where the state of the row is kept.
         decay: per row the exponents, or None: at the last observed row, `decay_span` later
             (batch, hidden), and (batch, 1) 1.0 where the cell acted at that row.
@@ -295,6 +296,7 @@ class _Nodes:
     last: Sequence[Tensor]
     rest: Sequence[Tensor]
     whole: Sequence[int]
+    read: Sequence[bool]
     commit: Sequence[Tensor]
     decay: Sequence[tuple[Tensor, Tensor, Tensor]] | None
 
@@ -312,14 +314,19 @@ class _Nodes:
             fresh = _given(inputs.updated)[..., None]
             each = zip(start.unbind(1), end.unbind(1), fresh.unbind(1), strict=True)
             decay = list(each)
-        whole = [0] * inputs.rows
+        whole, read = [0] * inputs.rows, [True] * inputs.rows
         if spec.max_step is not None and not spec.loops:
             whole = [int(n) for n in (last - first).amax(dim=(0, 2)).tolist()]
+            needed = inputs.gap > 0
+            if spec.decay:  # after an update, the whole exponent is still to be applied
+                needed = needed | ((_given(inputs.node) == 0) & (_given(inputs.updated) > 0))
+            read = needed.any(dim=0).tolist()
         return cls(
             first.unbind(1),
             last.unbind(1),
             inputs.gap[..., None].unbind(1),
             whole,
+            read,
             (commit > 0).unbind(1),
             decay,
         )
@@ -337,7 +344,7 @@ class _Nodes:
 
         def step(node: Tensor, y: Tensor, *applied: Tensor) -> tuple[Tensor, ...]:
             active = node < last
-            if not spec.loops:
+            if self.whole[i] > TRACKED_NODES:
                 cut = (last - node == TRACKED_NODES) & (node > first)
                 y = torch.where(cut, y.detach(), y)
                 applied = tuple(torch.where(cut, each.detach(), each) for each in applied)
@@ -357,7 +364,9 @@ class _Nodes:
         for _ in range(self.whole[i]):
             carried = step(*carried)
         node_state, applied = carried[1], carried[2] if decay is not None else None
-        if decay is None:
+        if not self.read[i]:
+            arrived = node_state
+        elif decay is None:
             arrived = dynamics.step(node_state, self.rest[i])
         else:
             assert applied is not None
