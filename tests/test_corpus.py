@@ -5,6 +5,9 @@ from __future__ import annotations
 import bz2
 import gzip
 import lzma
+import struct
+from pathlib import Path
+from typing import Any
 
 import fuzz
 import h5py
@@ -14,6 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from corpus import logs, tables
 
+from offbeat.cli import app
 from offbeat.cli.app import main
 from offbeat.cli.common import read_log
 from offbeat.data.readers import read
@@ -291,6 +295,42 @@ class TestABag:
             assert read(path).fingerprint() == whole.fingerprint()
 
 
+class TestMcap:
+    @pytest.mark.parametrize("profile", ["", "ros1", "ros2", "px4"])
+    def test_of_any_profile_has_the_topics_of_ros(self, profile, tmp_path):
+        path = logs.mcap_of_ros1(tmp_path / "log.mcap", profile)
+        for options in ({}, {"topics": ["/x"]}):
+            dataset = read(path, **options)
+            assert dataset.names == ("data",)
+            assert dataset[0].values[:, 0].tolist() == logs.X.tolist()
+            assert dataset[0].times == pytest.approx(logs.TICKS / 1e9)
+            for topic in ("/json (json", "/bytes (protobuf"):
+                assert topic in notes(dataset)
+        with pytest.raises(FileFormatError, match="only the messages of ROS can be read"):
+            read(path, topics=["/json"])
+
+    @pytest.mark.parametrize("cut", [1, 20, 45, 400, 4000])
+    def test_that_is_cut_off_anywhere_is_read_up_to_there(self, cut, tmp_path):
+        path = logs.mcap_of_ros1(tmp_path / "log.mcap", "ros1")
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-cut])
+        dataset = read(path)
+        rows = dataset[0].rows
+        assert rows == logs.ROWS or cut > 3000
+        assert dataset[0].values[:, 0].tolist() == logs.X[:rows].tolist()
+        assert "log.mcap is cut off" in notes(dataset)
+
+    def test_of_a_chunk_that_would_fill_the_memory_is_refused(self, tmp_path):
+        path = tmp_path / "log.mcap"
+        chunk = struct.pack("<QQQI", 0, 0, 2**40, 0) + struct.pack("<I", 0) + struct.pack("<Q", 0)
+        head = struct.pack("<BQ", 1, 8) + bytes(8)
+        end = struct.pack("<BQ", 2, 20) + bytes(20)
+        body = struct.pack("<BQ", 6, len(chunk)) + chunk
+        path.write_bytes(b"\x89MCAP0\r\n" + head + body + end + b"\x89MCAP0\r\n")
+        with pytest.raises(FileFormatError, match="a chunk has 1099511627776 bytes"):
+            read(path)
+
+
 class TestHdf5:
     @pytest.mark.parametrize("name", ["timestamps", "obs/timestamps", "obs/time", "stamp"])
     def test_has_the_times_that_stand_beside_its_observations(self, name, tmp_path):
@@ -495,3 +535,44 @@ def test_other_logs_have_the_unit_of_an_angle_that_the_run_found(tmp_path):
     for name, columns in (("wide", wide), ("narrow", narrow)):
         dataset = read_log(tables.write_csv(tmp_path / name, columns), None, run=tmp_path)
         assert dataset.units == ("deg",)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"time_column": "sec,nanosec"}, {"time_column": ["sec", "nanosec"]}),
+        ({"time_column": "[sec, nanosec]"}, {"time_column": ["sec", "nanosec"]}),
+        ({"time_column": "time(ms)"}, {"time_column": "time(ms)"}),
+        ({"angles": "yaw"}, {"angles": ("yaw",)}),
+        ({"topics": "/x"}, {"topics": ["/x"]}),
+        ({"without": "a,b"}, {"without": ("a", "b")}),
+        ({"missing": "-999"}, {"missing": ["-999"]}),
+        ({"missing": "-999,lost"}, {"missing": ["-999", "lost"]}),
+        ({"units": "{yaw: deg}"}, {"units": {"yaw": "deg"}}),
+        ({"files": "merge"}, {"files": "merge"}),
+        ({"column_names": "[t, x y]"}, {"column_names": ["t", "x y"]}),
+        ({"rate_hz": "50"}, {"rate_hz": 50}),
+    ],
+)
+def test_options_of_readers_are_typed_on_the_command_line(options, expected, monkeypatch):
+    given = {}
+    monkeypatch.setitem(app.COMMANDS, "inspect", inspect_with(given))
+    words = [f"--reader.{name}={value}" for name, value in options.items()]
+    assert main(["inspect", "log.csv", *words]) == 0
+    plain = {n: list(v) if isinstance(v, tuple) else v for n, v in given["reader"].items()}
+    assert plain == {n: list(v) if isinstance(v, tuple) else v for n, v in expected.items()}
+
+
+def inspect_with(given):
+    """A command that keeps the options it is called with."""
+
+    def command(data: Path, reader: dict[str, Any] | None = None) -> None:
+        """Inspect.
+
+        Args:
+            data: the log.
+            reader: how it is read.
+        """
+        given.update(reader=reader)
+
+    return command

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 
 import h5py
 import numpy as np
@@ -158,3 +159,50 @@ def changed_info(folder, **changes):
     path = folder / "meta" / "info.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
     return folder
+
+
+def _record(code, content):
+    return struct.pack("<BQ", code, len(content)) + content
+
+
+def _text(text):
+    return struct.pack("<I", len(text.encode())) + text.encode()
+
+
+def write_mcap(path, topics, *, profile="", end=True):
+    """An MCAP file without chunks.
+
+    Args:
+        path: of the file.
+        topics: {name: (encoding, type, encoding of the definition, definition, messages)}; messages
+            are (time of receipt, bytes).
+        profile: in the header.
+        end: whether it has an end, or was cut off.
+    """
+    magic = b"\x89MCAP0\r\n"
+    out = [magic, _record(1, _text(profile) + _text("tests"))]
+    for i, (topic, (encoding, kind, form, definition, _)) in enumerate(topics.items(), 1):
+        schema = struct.pack("<H", i) + _text(kind) + _text(form) + _text(definition)
+        out.append(_record(3, schema))
+        channel = struct.pack("<HH", i, i) + _text(topic) + _text(encoding) + struct.pack("<I", 0)
+        out.append(_record(4, channel))
+    for i, (*_, messages) in enumerate(topics.values(), 1):
+        for k, (received, message) in enumerate(messages):
+            head = struct.pack("<HIQQ", i, k, received, received)
+            out.append(_record(5, head + message))
+    if end:
+        out += [_record(15, bytes(4)), _record(2, bytes(20)), magic]
+    path.write_bytes(b"".join(out))
+    return path
+
+
+def mcap_of_ros1(path, profile):
+    """Numbers of ROS 1 in an MCAP file, beside a topic of JSON."""
+    numbers = [(START + int(t), struct.pack("<d", x)) for t, x in zip(TICKS, X, strict=True)]
+    texts = [(START + int(t), b'{"x": 1}') for t in TICKS]
+    topics = {
+        "/x": ("ros1", "std_msgs/Float64", "ros1msg", "float64 data", numbers),
+        "/json": ("json", "thing", "jsonschema", '{"type": "object"}', texts),
+        "/bytes": ("protobuf", "pkg.Thing", "protobuf", "\x01\x02", texts),
+    }
+    return write_mcap(path, topics, profile=profile)

@@ -15,7 +15,8 @@ import re
 from argparse import ArgumentError
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, NotRequired, get_args
+from types import UnionType
+from typing import Any, NamedTuple, NoReturn, NotRequired, Union, get_args, get_origin
 
 import yaml
 from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first unseen
@@ -255,7 +256,8 @@ class _Listed:
 
     def __init__(self, kind: Any) -> None:
         self.kind = kind
-        self.or_text = str in get_args(kind)
+        union = get_origin(kind) in (Union, UnionType)
+        self.or_text = union and str in get_args(kind)
 
     def __call__(self, text: str) -> Any:
         if self.or_text and "," not in text:

@@ -285,4 +285,4 @@ def is_list(kind: Any) -> bool:
 
 def line_error(path: Path, error: Any) -> FileFormatError:
     """An error of Arrow about a file, in one line."""
-    return FileFormatError(f"{path}: {' '.join(str(error).split())}")
+    return FileFormatError(f"{path}: {' '.join(str(error).split())[:200]}")

@@ -276,5 +276,5 @@ def read_columns(path: Path, columns: list[str]) -> Any:
     except (pa.ArrowException, OSError, ValueError) as error:
         raise FileFormatError(
             f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
-            f"({' '.join(str(error).split())}); download it again"
+            f"({' '.join(str(error).split())[:120]}); download it again"
         ) from None

@@ -284,7 +284,7 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
             ) from None
         raise FileFormatError(
             f"{path} can't be read as NPZ, it is truncated, damaged or of another format "
-            f"({' '.join(str(error).split())}); copy it again"
+            f"({' '.join(str(error).split())[:120]}); copy it again"
         ) from None
 
 

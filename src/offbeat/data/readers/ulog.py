@@ -171,7 +171,7 @@ def _parsed(path: Path, wanted: _Wanted) -> tuple[Any, list[str]]:
             log = ULog(file, wanted)
     except Exception as error:
         file.close()
-        what = " ".join(str(error).split()) or type(error).__name__
+        what = " ".join(str(error).split())[:120] or type(error).__name__
         raise FileFormatError(
             f"{path} can't be read as a ULog, it is truncated, damaged or of another format "
             f"({what}); copy it from the vehicle again"
