@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import offbeat as ob
-from offbeat.baselines import cross_fitted, fit_baseline, folds_of
+from offbeat.baselines import cross_fitted, fit_baseline, folds_of, residual_gru
 from offbeat.baselines.folds import row_folds
 from offbeat.baselines.held_out import Products, held_out_ridge
 from offbeat.baselines.kernel_ridge import gaussians, whitening
+from offbeat.baselines.residual_gru import ResidualGru, step
 from offbeat.baselines.ridge_fill import backwards
 from offbeat.data.tasks import TaskConfig, draw_tasks, take_tasks
 
@@ -225,6 +227,49 @@ def test_a_kernel_learns_a_motion_that_bends_with_the_place():
         fitted = fit_baseline(name, data[:60])
         errors[name] = missed(fitted, data[60:])
     assert errors["kernel_ridge"] < 0.6 * errors["ridge"]
+
+
+# --- a recurrent network --------------------------------------------------------------------------
+
+
+def test_the_state_of_the_network_is_that_of_torch():
+    torch.manual_seed(0)
+    gru = torch.nn.GRU(8, 5, batch_first=True).double()
+    network = ResidualGru()
+    network.input_weight, network.hidden_weight = (
+        w.detach().numpy().T for w in (gru.weight_ih_l0, gru.weight_hh_l0)
+    )
+    network.input_bias, network.hidden_bias = (
+        b.detach().numpy() for b in (gru.bias_ih_l0, gru.bias_hh_l0)
+    )
+    inputs, hidden = torch.randn(3, 8).double(), torch.randn(3, 5).double()
+    expected = gru(inputs[:, None], hidden[None])[0][:, 0].detach().numpy()
+    assert step(network, inputs.numpy(), hidden.numpy()) == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_network_comes_near_the_best_prediction(monkeypatch):
+    monkeypatch.setattr(residual_gru, "STEPS", 240)
+    train = cut(second_order(200, seed=0), 64)
+    test = cut(second_order(100, seed=1), 60)
+    x = np.stack([t.values[:, 0] for t in test])[:, 10:60]
+    errors = {
+        name: rms(np.stack([p[10:60, 0] for p in fit_baseline(name, train).predict(test)]) - x)
+        for name in ("last_value", "residual_gru")
+    }
+    # The best prediction misses by the noise, of deviation 1.
+    assert errors["residual_gru"] < 1.05
+    assert errors["last_value"] > 1.3
+
+
+def test_training_a_network_leaves_the_generators_of_others_alone(monkeypatch):
+    monkeypatch.setattr(residual_gru, "STEPS", 12)
+    torch.manual_seed(7)
+    np.random.seed(7)  # noqa: NPY002
+    expected = torch.rand(1), np.random.random()  # noqa: NPY002
+    torch.manual_seed(7)
+    np.random.seed(7)  # noqa: NPY002
+    fit_baseline("residual_gru", second_order(4, seed=0))
+    assert (torch.rand(1), np.random.random()) == expected  # noqa: NPY002
 
 
 # --- folds ----------------------------------------------------------------------------------------

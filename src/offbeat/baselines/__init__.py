@@ -22,6 +22,7 @@ from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.kalman_channels import KalmanLong, KalmanShort, Smoother
 from offbeat.baselines.kalman_groups import MotionFilter, MotionSmoother
 from offbeat.baselines.kernel_ridge import KernelRidge
+from offbeat.baselines.residual_gru import ResidualGru
 from offbeat.baselines.ridge import Ridge
 from offbeat.baselines.ridge_fill import RidgeFill
 from offbeat.baselines.simple import (
@@ -53,6 +54,7 @@ __all__ = [
     "MotionFilter",
     "MotionSmoother",
     "Pchip",
+    "ResidualGru",
     "Ridge",
     "RidgeFill",
     "RunningMean",
