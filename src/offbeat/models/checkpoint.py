@@ -72,7 +72,7 @@ def load_model(path: str | Path) -> Any:
     weights = {k: v for k, v in tensors.items() if not k.startswith("training.")}
     try:
         _check_sizes(record["model"], weights)
-        model = _build(record)
+        model = _build(record, weights)
         if record["dtype"] == "float64":
             model.double()
         model.load_state_dict(weights)
@@ -81,7 +81,8 @@ def load_model(path: str | Path) -> Any:
         raise FileFormatError(
             f"{path}: its config and its weights disagree ({type(error).__name__}: {what})"
         ) from None
-    bad = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
+    trained = (name for name, _ in model.named_parameters() if name in weights)
+    bad = [name for name in trained if not weights[name].isfinite().all()]
     if bad:
         raise FileFormatError(
             f"{path} has weights that are not finite, in {bad[0]}, so that it predicts nothing; "
@@ -162,7 +163,7 @@ def _record(model: BaseModel) -> dict[str, Any]:
     }
 
 
-def _build(record: dict[str, Any]) -> BaseModel:
+def _build(record: dict[str, Any], weights: dict[str, Tensor]) -> BaseModel:
     data = DataInfo(
         names=tuple(record["names"]),
         units=tuple(record["units"]),
@@ -172,7 +173,8 @@ def _build(record: dict[str, Any]) -> BaseModel:
         transforms=Transforms.from_dict(record["transforms"]),
     )
     if "inner" in record["model"]:
-        return CorrectedModel.restored(record["model"]["inner"], record["model"]["base"], data)
+        parts = record["model"]
+        return CorrectedModel.restored(parts["inner"], parts["base"], data, weights)
     config = record["model"]
     if "name" in config:  # a composed model, perhaps of a version without these options
         config = {"nodes": "rows", "bounded": False, **config}

@@ -39,6 +39,7 @@ GATE = 1.0
 STACK = "stack"
 """Name of a weighted mean of baselines, which is made of registered ones."""
 
+_ARRAYS = "base/"  # prefix of the arrays of a baseline; names of buffers have no dots
 _CHUNK = 256
 
 
@@ -90,8 +91,9 @@ class CorrectedModel(BaseModel):
         # Logits of the gates.
         self.gate = nn.Parameter(torch.full_like(scale, GATE)) if inner.config.anchored else None
         # Saved with the weights; the base itself works on arrays.
-        for name, array in self._arrays().items():
-            self.register_buffer(_buffer(name), torch.from_numpy(np.array(array)))
+        for name, array in {**base.arrays(), "bins": bins.edges}.items():
+            own = torch.from_numpy(np.array(array))
+            self.register_buffer(_ARRAYS + name.replace(".", "/"), own)
 
     @classmethod
     def of(cls, inner: Model, base: CausalBaseline, tasks: Dataset) -> CorrectedModel:
@@ -109,57 +111,47 @@ class CorrectedModel(BaseModel):
             _start_at_zero(inner)
         batch, bins = inner.batch(tasks), AgeBins.of(tasks)
         shape = (len(bins) + 1, inner.channels)
-        found = cls(inner, base, bins, torch.ones(shape, dtype=inner.dtype))
+        found = cls(inner, base, bins, torch.ones(shape, dtype=inner.dtype, device=inner.device))
         table = ErrorTable.of(found.predicted_by_base(batch), batch, bins, clipped=CLIPPED)
         found.scale.copy_(table.typical(inner.std.cpu()))
         return found
 
     @classmethod
     def restored(
-        cls, inner: Mapping[str, Any], base: Mapping[str, Any], data: DataInfo
+        cls, inner: Mapping[str, Any], base: str, data: DataInfo, weights: Mapping[str, Tensor]
     ) -> CorrectedModel:
         """Makes a model of the same parts as one that was saved; its weights are to be loaded.
 
         Args:
             inner: config of the inner model.
-            base: as in `options`.
+            base: name of the baseline.
             data: properties of the data that it is made for.
+            weights: saved, among them the arrays of the baseline.
+
+        Raises:
+            InputError: there is no such baseline, or it is not causal.
+            KeyError: an array is missing.
         """
-        kind = Stack if base["name"] == STACK else BASELINES[base["name"]]
         arrays = {
-            name: np.zeros(shape, dtype=np.dtype(type_))
-            for name, (type_, shape) in base["arrays"].items()
+            name.removeprefix(_ARRAYS).replace("/", "."): value.numpy().copy()
+            for name, value in weights.items()
+            if name.startswith(_ARRAYS)
         }
-        edges = arrays.pop("bins")
-        made = kind().restore(arrays)
+        bins = AgeBins(arrays.pop("bins"))
+        made = (Stack if base == STACK else BASELINES[base])().restore(arrays)
         if not isinstance(made, CausalBaseline):
-            raise InputError(f"the baseline {base['name']!r} is not causal and cannot be corrected")
+            raise InputError(f"the baseline {base!r} is not causal and cannot be corrected")
         model = Model(from_mapping(ModelConfig, dict(inner)), data)
-        scale = torch.ones((len(edges) + 1, model.channels), dtype=model.dtype)
-        return cls(model, made, AgeBins(edges), scale)
+        return cls(model, made, bins, weights["scale"].to(model.dtype))
 
     @property
     def options(self) -> dict[str, Any]:
         """JSON-like description of the parts, saved with the model."""
-        arrays = {k: [str(v.dtype), list(v.shape)] for k, v in self._arrays().items()}
         return {
             "name": self.inner.name,
             "inner": asdict(self.inner.config),
-            "base": {"name": name_of(self.base), "arrays": arrays},
+            "base": name_of(self.base),
         }
-
-    def _arrays(self) -> dict[str, Any]:
-        arrays = {name: np.asarray(array) for name, array in self.base.arrays().items()}
-        return {**arrays, "bins": self.bins.edges}
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
-        """Loads weights, and the base's arrays with them."""
-        found = super().load_state_dict(state_dict, *args, **options)
-        buffers = dict(self.named_buffers())
-        arrays = {name: buffers[_buffer(name)].cpu().numpy().copy() for name in self._arrays()}
-        self.bins = AgeBins(arrays.pop("bins"))
-        self.base.restore(arrays)
-        return found
 
     @property
     def dtype(self) -> torch.dtype:
@@ -282,11 +274,6 @@ def refitted(base: CausalBaseline, tasks: Dataset) -> CausalBaseline:
     other = type(base)().fit(tasks)
     assert isinstance(other, CausalBaseline)
     return other
-
-
-def _buffer(name: str) -> str:
-    """Name of a buffer, in which a module allows no dot."""
-    return "base/" + name.replace(".", "/")
 
 
 def _start_at_zero(inner: Model) -> None:
