@@ -135,6 +135,30 @@ def test_outliers_and_long_times_give_bounded_predictions():
     assert predicted[-1, 0] == predicted[-2, 0]
 
 
+@pytest.mark.parametrize("name", ["ridge", "kernel_ridge", "residual_gru"])
+def test_rounding_decides_nothing_on_a_regular_grid(name, monkeypatch):
+    monkeypatch.setattr(residual_gru, "STEPS", 12)
+    random = np.random.default_rng(0)
+    made = []
+    for _ in range(40):
+        observed = np.ones((60, 2), dtype=bool)
+        first = int(random.integers(5, 30))
+        observed[first : first + 20, int(random.integers(2))] = False
+        observed[40:55] = False
+        values = np.cumsum(random.standard_normal((60, 2)), axis=0)
+        made.append(ob.Trajectory(np.arange(60) / 30, values, observed=observed))
+    fitted = fit_baseline(name, ob.Dataset(tuple(made)))
+    t = made[0]
+    expected = fitted.predict(ob.Dataset((t,)))[0]
+    state = fitted.start(torch.zeros(1, 2))
+    for row in range(t.rows):
+        time = torch.tensor([[t.times[row]]], dtype=torch.float32)
+        read = fitted.read(state, time)[0].numpy()
+        assert read == pytest.approx(expected[row], abs=1e-3)
+        values = torch.tensor(t.values[None, row], dtype=torch.float32)
+        state = fitted.observe(state, time, values, torch.tensor(t.observed[None, row]))
+
+
 def test_predictions_do_not_change_with_units():
     tasks = cut(second_order(50, seed=0), 60)
     other = ob.Dataset(tuple(replace(t, values=1e3 * t.values - 40) for t in tasks))

@@ -11,6 +11,9 @@ from offbeat.data.trajectory import Dataset
 OWN, EACH = 13, 10
 """Features of the channel itself, and of each other one."""
 
+DENSE = 0.55
+"""Another channel is observed more often where its gap is at most this part of the gap."""
+
 SIZE = 128
 """Trajectories that are handled together."""
 
@@ -144,7 +147,7 @@ class Gaps:
         self, c: int, near: NDArray[np.int64], task: NDArray[np.int64], row: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """(values, others) whether others are observed more often at a value and its neighbours."""
-        gap = 0.5 * self.gap[task, row, c][:, None]
+        gap = DENSE * self.gap[task, row, c][:, None]
         rows = (row, self._before[task, row, c], self._after[task, row, c])
         enough = [self.spacing[task[:, None], at[:, None], near] <= gap for at in rows]
         return np.asarray(np.all(enough, axis=0))
@@ -169,7 +172,8 @@ class Gaps:
             bend = here - left - u * (right - left)
             columns += [np.where(dense, bend, 0.0), bend]
         close = (
-            self.spacing[task[:, None], row[:, None], near] <= 0.5 * self.gap[task, row, c][:, None]
+            self.spacing[task[:, None], row[:, None], near]
+            <= DENSE * self.gap[task, row, c][:, None]
         )
         columns.append(np.where(close, self.slope[task[:, None], row[:, None], near], 0.0))
         columns.append(np.where(close, self.line[task, row, c][:, None], 0.0))

@@ -23,6 +23,9 @@ from offbeat.data.trajectory import Dataset
 SPANS = (1, 2, 4)
 """Intervals that the slopes span."""
 
+OTHERS = 0.55
+"""Others are still observed where the newest value is younger by this factor."""
+
 AVERAGES = 2
 """Exponential averages of each channel."""
 
@@ -41,7 +44,7 @@ class Ridge(CausalBaseline):
     :math:`r`, which is :math:`a` over the middle of its bin, features :math:`\phi` of all channels
     and :math:`\psi` of its own. Weights differ between the bins of `AgeBins`, and in each of them
     between an outage of all channels and one of this channel, where others were observed in the
-    second half of :math:`a`. A channel that was not observed yet has further weights, :math:`r = 1`
+    last 55 % of :math:`a`. A channel that was not observed yet has further weights, :math:`r = 1`
     and the training mean as its last value.
 
     The features of a channel are its last value, its slopes over 1, 2 and 4 intervals, and its last
@@ -172,7 +175,7 @@ class Ridge(CausalBaseline):
         age = xp.clip(age, 0.0, float(self.edges[-1]))
         at = bins.of_age(age)
         relative = age / as_kind(bins.middle, age)[at]
-        others = xp.amin(age, -1)[..., None] < 0.5 * age
+        others = xp.amin(age, -1)[..., None] < OTHERS * age
         at = xp.where(others, at + len(bins), at)
         return (
             xp.where(seen, at, 0 * at + 2 * len(bins)),
@@ -184,7 +187,9 @@ class Ridge(CausalBaseline):
     def estimate(self, tasks: Dataset) -> None:
         """See `Baseline`."""
         gap, longest = typical_gap(tasks), longest_age(tasks)
-        self.edges = AgeBins.of(tasks).edges
+        self.edges = (
+            1.02 * AgeBins.of(tasks).edges
+        )  # not at multiples of a gap, where rounding decides
         self.averages = np.geomspace(4 * gap, max(longest, 8 * gap), AVERAGES)
         known = [np.where(t.known, t.values, np.nan) for t in tasks]
         every = np.concatenate([*known, np.where(np.isfinite(self.mean), self.mean, 0.0)[None]])

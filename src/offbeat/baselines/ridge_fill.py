@@ -99,7 +99,7 @@ class RidgeFill(Baseline):
         some = some_tasks(tasks, CELLS / tasks.channels)  # the first measure the features
         alike = np.argsort(-likeness(some), axis=1, kind="stable")
         self.near = np.ascontiguousarray(alike[:, 1 : NEAR + 1])
-        self.edges = AgeBins.of_lengths(2 * typical_gap(tasks), longest_gap(some)).edges
+        self.edges = 1.02 * AgeBins.of_lengths(2 * typical_gap(tasks), longest_gap(some)).edges
         bins, channels = len(self.edges), tasks.channels
         size = OWN + EACH * self.near.shape[1]
         products = np.zeros((KINDS * bins, channels, FOLDS, size + 1, size + 1))
