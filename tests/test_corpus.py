@@ -279,6 +279,12 @@ class TestABag:
         assert trajectory.known.all()
         assert "the headers of /uptime and of /imu have no time in common" in notes(dataset)
 
+    def test_whose_header_stamps_stand_still_takes_the_times_of_receipt(self, form, tmp_path):
+        (trajectory,) = dataset = read(logs.clocks_apart(tmp_path, form, still=True))
+        assert trajectory.rows == logs.ROWS
+        assert trajectory.times == pytest.approx(logs.TICKS / 1e9)
+        assert "header stamps repeat, and times of receipt are taken, in /uptime" in notes(dataset)
+
     def test_with_a_topic_that_cannot_be_read_has_the_others(self, form, tmp_path):
         path = logs.with_a_foreign_topic(tmp_path, form)
         for options in ({}, {"topics": ["/x"]}):

@@ -90,13 +90,17 @@ def poses_in_two_frames(folder, form):
     )
 
 
-def clocks_apart(folder, form):
-    """Two topics on header clocks that never meet: one counts from when its device was started."""
+def clocks_apart(folder, form, *, still=False):
+    """Two topics on header clocks that never meet: one counts from when its device was started.
+
+    Or, with `still`, one whose stamps never change.
+    """
     store = base_store(form)
     messages = []
     for t, x in zip(TICKS, X, strict=True):
         received = START + int(t)
-        for topic, stamp in (("/imu", START + int(t)), ("/uptime", 5 * S + int(t))):
+        other = START if still else 5 * S + int(t)
+        for topic, stamp in (("/imu", START + int(t)), ("/uptime", other)):
             message = logs.pose_message(store, stamp, [x, 0, 0, 0, 0, 0, 1])
             messages.append((topic, received, message))
     return write_bag(folder, form, messages)

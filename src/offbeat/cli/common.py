@@ -60,14 +60,16 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
     dataset = read(data, **options)
     if not isinstance(found, dict) or "found" not in dataset.meta:
         return dataset
+    known = known_options(data, options)
     # Nothing in the log states its unit of time, or of an angle: they are those of the run.
     own = dataset.meta["found"]
     other = {}
-    if found.get("time_unit", own.get("time_unit")) != own.get("time_unit"):
+    stated = found.get("time_unit", own.get("time_unit"))
+    if stated != own.get("time_unit") and "time_unit" in known:
         other["time_unit"] = found["time_unit"]
     wrong = [n for n, unit in own.get("units", {}).items() if unit != "deg"]
     degrees = {n: "deg" for n in wrong if found.get("units", {}).get(n) == "deg"}
-    if degrees:
+    if degrees and ("units" in known or "units" in options):
         other["units"] = {**(options.get("units") or {}), **degrees}
     return read(data, **{**options, **other}) if other else dataset
 

@@ -254,6 +254,10 @@ def _clocks(topics: list[Topic], stamps: str, notes: list[str]) -> dict[str, boo
     if stamps == "receive":
         return chosen
     filled = [t for t in topics if t.parts]
+    stuck = [t.name for t in filled if chosen[t.name] and t.is_stuck]
+    if stuck:
+        chosen |= dict.fromkeys(stuck, False)
+        notes.append(f"header stamps repeat, and times of receipt are taken, in {', '.join(stuck)}")
     headed = [t for t in filled if chosen[t.name]]
     without = [t for t in filled if not chosen[t.name]]
     unmet = _unmet(headed)

@@ -21,6 +21,7 @@ from offbeat.errors import FileFormatError
 
 _Key = tuple[str, tuple[str, ...]]
 _MOST_FRAMES = 16  # of one signal
+_FEW_ROWS = 10
 _LAYOUTS = 64  # kept per topic and length of message
 
 
@@ -145,6 +146,18 @@ class Topic:
         return bool(every) and all(
             stamps is not None and bool((stamps != 0).any()) for stamps in every
         )
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether most rows of a signal have the header stamp of the one before, unlike receipt."""
+        for parts in self.parts.values():
+            headers = [part.header for part in parts if part.header is not None]
+            received = np.concatenate([part.received for part in parts])
+            stamps = np.concatenate(headers) if headers else received
+            steps, apart = np.count_nonzero(np.diff(stamps)), np.count_nonzero(np.diff(received))
+            if len(stamps) > _FEW_ROWS and 2 * steps < apart:
+                return True
+        return False
 
     def offset(self) -> float:
         """The median of header stamp minus time of receipt, in nanoseconds."""
