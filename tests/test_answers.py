@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,19 +12,9 @@ from model_helpers import dataset, small_model, with_observed
 from scipy.interpolate import PchipInterpolator
 
 import offbeat as ob
-from offbeat.answers.fill_rule import (
-    GROUPS,
-    SIDES,
-    START,
-    FillRule,
-    NormalEquations,
-    _ridge_solution,
-    group_of,
-)
+from offbeat.answers.both_sides import reversed_in_time
 from offbeat.answers.scoring import ChannelScores, _targets
-from offbeat.answers.two_sided import _sides_of, fit_rule, reversed_in_time
 from offbeat.baselines import fill, fillers, forecast, forecasters
-from offbeat.data.masking import masked_values
 from offbeat.data.rows import add_rows, times_at_rate
 
 NAN = float("nan")
@@ -37,21 +26,18 @@ def one_channel(times, values, observed) -> ob.Trajectory:
     return ob.Trajectory(times, np.asarray(values, dtype=float)[:, None], observed=mask)
 
 
-def pair_of(data: ob.Dataset, name: str = "anchored_ode_gru_d", **options) -> ob.TwoSided:
-    """Two models with drawn weights and a rule with weights of its own in every group."""
+def blend_of(data: ob.Dataset, name: str = "anchored_ode_gru_d", **options) -> ob.Blend:
+    """Two models with drawn weights, and gamma and weights of its own in every kind of value."""
     forward = small_model(name, data, seed=1, std=0.2, **options)
     backward = small_model(name, reversed_in_time(data), seed=2, std=0.2, **options)
+    members = ("last_value", "constant_velocity"), ("linear", "pchip")
+    blend = ob.fit_blend(data, data, forward, backward, causal=members[0], two_sided=members[1])
     random = np.random.default_rng(0)
-    weights = random.uniform(-1, 1, (data.channels, len(SIDES), GROUPS, START.shape[1]))
-    cells = np.ones((len(SIDES), GROUPS), dtype=int)
-    chosen = (("ridge 10",) * len(SIDES),) * data.channels
-    return ob.TwoSided(forward, backward, FillRule(0.01, weights, cells, chosen))
-
-
-def fill_with(weights, trajectory: ob.Trajectory, f, b) -> np.ndarray:
-    """What the rule says with one set of weights everywhere; f and b are given."""
-    sides = _sides_of(trajectory, np.asarray(f, float), np.asarray(b, float))
-    return np.asarray(sides.base + (np.asarray(weights)[sides.side] * sides.terms).sum(axis=2))
+    weights = random.dirichlet(np.ones(3), blend.both.weights.shape[:2])
+    both = replace(
+        blend.both, weights=weights, gamma=random.uniform(0.2, 1, blend.both.gamma.shape)
+    )
+    return replace(blend, both=both, gamma=random.uniform(0.2, 1, blend.gamma.shape))
 
 
 # --- trivial predictors ---------------------------------------------------------------------------
@@ -111,126 +97,6 @@ def test_forecasts_by_hand():
         assert forecast(never, at, method, [4.0])[:, 0].tolist() == [4, 4]
 
 
-# --- the rule -------------------------------------------------------------------------------------
-
-
-def test_models_that_go_on_straight_give_the_cubic_hermite_interpolation():
-    """Exact for any cubic: the start weights with tangents for predictions."""
-    times = np.array([0.0, 0.3, 0.5, 1.1, 1.9, 2.0])
-    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.7, 3.0])
-    one = one_channel(times, cubic(times), [0, 5])
-    slope = cubic.deriv()
-    f = cubic(0.0) + slope(0.0) * times
-    b = cubic(2.0) + slope(2.0) * (times - 2.0)
-    got = fill_with(START, one, f[:, None], b[:, None])[1:5, 0]
-    np.testing.assert_allclose(got, cubic(times[1:5]), rtol=0, atol=1e-12)
-
-
-def test_the_rule_contains_linear_interpolation_and_pchip_and_the_last_values():
-    (one,) = dataset(1, rows=30)
-    random = np.random.default_rng(0)
-    f, b = random.normal(size=(2, 30, 3))
-    masked = ~one.observed
-    observed = [1.0, 0, 0, 0, 0]
-    for last, method in (([0, 0, 0, 1.0, 0], "linear"), ([0, 0, 0, 0, 1.0], "pchip")):
-        got = fill_with([last, observed, observed], one, f, b)
-        expected = fill(one, method, [0.0] * 3)
-        np.testing.assert_allclose(got[masked], expected[masked], rtol=0, atol=1e-12)
-    # Two predictors that hold what they saw cross-fade along the straight line.
-    first = one_channel([0.0, 0.2, 1.0], [3, NAN, 5], [0, 2])
-    faded = fill_with(np.zeros((3, 5)), first, [[3], [3], [3]], [[5], [5], [5]])
-    np.testing.assert_allclose(faded[1, 0], 3.4, atol=1e-12)
-
-
-def test_outside_the_observations_there_is_one_side_alone():
-    one = one_channel([0.0, 1.0, 2.0], [NAN, 5, NAN], [1])
-    got = fill_with(START, one, [[1], [2], [3]], [[10], [20], [30]])
-    assert got[:, 0].tolist()[::2] == [10, 3]
-    pulled = fill_with([[0] * 5, [0.5, 0, 0, 0, 0], [0.25, 0, 0, 0, 0]], one, [[1], [2], [3]],
-                       [[10], [20], [30]])  # fmt: skip
-    assert pulled[:, 0].tolist()[::2] == [10 - 0.25 * 5, 3 + 0.5 * 2]
-    never = one_channel([0.0, 1.0], [NAN, NAN], [])
-    assert fill_with(START, never, [[1], [2]], [[10], [20]])[:, 0].tolist() == [5.5, 11]
-
-
-@given(st.integers(0, 200), st.floats(0.5, 100))
-def test_weights_are_the_least_squares_solution_with_the_ridge_as_extra_rows(seed, ridge):
-    random = np.random.default_rng(seed)
-    phi, y = random.normal(size=(30, 5)), random.normal(size=30)
-    towards = random.normal(size=5)
-    got = _ridge_solution(phi.T @ phi, phi.T @ y, 30, ridge, towards)
-    root = np.sqrt(ridge * np.diag(phi.T @ phi) / 30)
-    rows, right = np.vstack([phi, np.diag(root)]), np.concatenate([y, root * towards])
-    expected = np.linalg.lstsq(rows, right, rcond=None)[0]
-    np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-8)
-
-
-def test_many_values_of_a_known_rule_give_its_weights_back_per_channel_and_group():
-    random = np.random.default_rng(1)
-    true = random.uniform(-1, 1, (2, 4, 5))  # channels, groups 0 to 3
-    equations = NormalEquations(2, 0.1)
-    rows = 40_000
-    for _ in range(5):
-        terms = random.normal(size=(rows, 2, 5))
-        group = random.integers(0, 4, (rows, 2))
-        missed = (terms * true[np.arange(2), group]).sum(axis=2)
-        side, length = np.zeros((rows, 2), dtype=int), 0.1 * 2.0**group
-        equations.add(terms, missed, side, length, np.ones((rows, 2), dtype=bool))
-    rule = equations.rule()
-    np.testing.assert_allclose(rule.weights[:, 0, :4], true, atol=2e-3)
-    assert rule.counts[0, :4].sum() == 5 * 2 * rows
-    assert rule.counts[1:].sum() == 0
-    assert np.array_equal(rule.weights[0, 1, 0], START[1]), "unseen sides keep the start"
-    assert [names[0] for names in rule.chosen] == ["ridge 3"] * 2, "shrunk as little as can be"
-
-
-@pytest.mark.parametrize(("weight", "name"), [(3, "line"), (4, "pchip")])
-def test_a_channel_for_which_the_models_are_noise_gets_the_line_or_the_curve_alone(weight, name):
-    random = np.random.default_rng(2)
-    equations = NormalEquations(2, 0.1)
-    for _ in range(10):
-        terms = random.normal(size=(20, 2, 5))
-        missed = terms[:, :, weight].copy()
-        missed[:, 1] = terms[:, 1] @ [0.5, 0.5, 0.2, 0.3, 0.1]
-        missed += 1e-3 * random.normal(size=missed.shape)
-        side, length = np.zeros((20, 2), dtype=int), np.full((20, 2), 0.1)
-        equations.add(terms, missed, side, length, np.ones((20, 2), dtype=bool))
-    rule = equations.rule()
-    assert rule.chosen[0][0] == name
-    assert rule.weights[0, 0, 0].tolist() == [float(i == weight) for i in range(5)]
-    assert rule.chosen[1][0].startswith("ridge")
-
-
-def test_a_noisy_channel_does_not_choose_for_a_quiet_one():
-    """Weights of a channel do not depend on its unit, or on the unit of another."""
-    random = np.random.default_rng(3)
-    terms, missed = random.normal(size=(4, 50, 2, 5)), random.normal(size=(4, 50, 2))
-    rules = []
-    for scale in (1.0, 1e4):
-        equations = NormalEquations(2, 0.1)
-        size = np.array([1.0, scale])
-        for k in range(4):
-            side, length = np.zeros((50, 2), dtype=int), np.full((50, 2), 0.1)
-            ones = np.ones((50, 2), dtype=bool)
-            equations.add(terms[k] * size[:, None], missed[k] * size, side, length, ones)
-        rules.append(equations.rule())
-    assert rules[0].chosen == rules[1].chosen
-    np.testing.assert_allclose(rules[0].weights, rules[1].weights, rtol=1e-7, atol=1e-9)
-
-
-def test_gaps_are_grouped_at_powers_of_two_of_the_unit():
-    lengths = np.array([0.0, 0.1, 0.10001, 0.2, 0.4, 0.41, 1e9])
-    assert group_of(lengths, 0.1).tolist() == [0, 0, 1, 1, 2, 3, GROUPS - 1]
-
-
-def test_a_rule_survives_json_to_the_last_bit():
-    rule = pair_of(dataset(3)).rule
-    again = FillRule.from_dict(json.loads(json.dumps(rule.to_dict())))
-    assert again.weights.tobytes() == rule.weights.tobytes()
-    assert np.array_equal(again.counts, rule.counts)
-    assert (again.gap_unit, again.chosen) == (rule.gap_unit, rule.chosen)
-
-
 # --- impute ---------------------------------------------------------------------------------------
 
 
@@ -238,7 +104,7 @@ def test_a_rule_survives_json_to_the_last_bit():
 @pytest.mark.parametrize("mode", ["causal", "two_sided"])
 def test_a_fill_never_uses_the_value_itself_or_another_masked_one(name, mode):
     data = dataset(3, rows=20)
-    pair = pair_of(data, name)
+    blend = blend_of(data, name)
     random = np.random.default_rng(5)
     other = ob.Dataset(
         tuple(
@@ -249,16 +115,16 @@ def test_a_fill_never_uses_the_value_itself_or_another_masked_one(name, mode):
     unknown = ob.Dataset(
         tuple(replace(t, values=np.where(t.observed, t.values, NAN)) for t in data)
     )
-    first = ob.impute(pair, data, mode=mode)
+    first = ob.impute(blend, data, mode=mode)
     for changed in (other, unknown):
-        for a, b in zip(first, ob.impute(pair, changed, mode=mode), strict=True):
+        for a, b in zip(first, ob.impute(blend, changed, mode=mode), strict=True):
             assert a.values.tobytes() == b.values.tobytes()
 
 
 @pytest.mark.parametrize("mode", ["causal", "two_sided"])
 def test_what_was_observed_comes_back_and_everything_else_is_filled(mode):
     data = dataset(4)
-    filled = ob.impute(pair_of(data), data, mode=mode)
+    filled = ob.impute(blend_of(data), data, mode=mode)
     for one, before in zip(filled, data, strict=True):
         assert np.array_equal(one.observed, before.observed)
         assert np.array_equal(one.values[one.observed], before.values[before.observed])
@@ -268,9 +134,9 @@ def test_what_was_observed_comes_back_and_everything_else_is_filled(mode):
 
 def test_a_causal_fill_is_the_prediction_and_looks_at_the_past_alone():
     data = dataset(2, rows=24)
-    pair = pair_of(data)
-    filled = ob.impute(pair.forward, data)
-    for one, said in zip(filled, ob.predict(pair.forward, data), strict=True):
+    blend = blend_of(data)
+    filled = ob.impute(blend.forward, data)
+    for one, said in zip(filled, ob.predict(blend.forward, data), strict=True):
         assert np.array_equal(one.values[~one.observed], said.values[~one.observed])
     late = ob.Dataset(
         tuple(
@@ -278,21 +144,10 @@ def test_a_causal_fill_is_the_prediction_and_looks_at_the_past_alone():
             for t in data
         )
     )
-    two_sided = ob.impute(pair, data), ob.impute(pair, late)
-    for i, (a, b) in enumerate(zip(filled, ob.impute(pair.forward, late), strict=True)):
+    two_sided = ob.impute(blend, data), ob.impute(blend, late)
+    for i, (a, b) in enumerate(zip(filled, ob.impute(blend.forward, late), strict=True)):
         assert np.array_equal(a.values[:12], b.values[:12])
         assert not np.array_equal(two_sided[0][i].values[:12], two_sided[1][i].values[:12])
-
-
-def test_filling_backwards_with_the_models_swapped_is_the_same():
-    data = dataset(3, rows=25)
-    pair = pair_of(data)
-    rule = FillRule.start(3, 0.05)
-    ahead = ob.impute(ob.TwoSided(pair.forward, pair.backward, rule), data)
-    swapped = ob.TwoSided(pair.backward, pair.forward, rule)
-    back = reversed_in_time(ob.impute(swapped, reversed_in_time(data)))
-    for a, b in zip(ahead, back, strict=True):
-        np.testing.assert_allclose(a.values, b.values, rtol=0, atol=1e-10)
 
 
 def test_time_reversed_twice_is_the_data():
@@ -305,14 +160,14 @@ def test_time_reversed_twice_is_the_data():
 
 def test_channels_in_another_order_are_filled_alike():
     data = dataset(2)
-    pair = pair_of(data)
+    blend = blend_of(data)
     turned = data.select(["channel_2", "channel_0", "channel_1"])
-    for a, b in zip(ob.impute(pair, data), ob.impute(pair, turned), strict=True):
+    for a, b in zip(ob.impute(blend, data), ob.impute(blend, turned), strict=True):
         assert a.names == b.names
         assert np.array_equal(a.values, b.values)
 
 
-def test_filling_from_both_sides_needs_a_pair():
+def test_filling_from_both_sides_needs_a_blend():
     data = dataset(2)
     with pytest.raises(ob.InputError):
         ob.impute(small_model("gru", data), data, mode="two_sided")
@@ -320,64 +175,19 @@ def test_filling_from_both_sides_needs_a_pair():
         ob.impute(small_model("gru", data), data, mode="casual")
 
 
-# --- the pair: trained, saved, loaded -------------------------------------------------------------
-
-
-CONFIG = ob.TrainConfig(epochs=2, batch_size=4, optimizer="adam")
-
-
-def trained(out=None) -> tuple[ob.TwoSided, ob.Dataset]:
-    data = ob.mask_out(dataset(8, rows=15, share=2.0), 0.6, mask="values", seed=1)
-    train, validation = data[:5], data[5:]
-    model = ob.make_model("gru_d", train, hidden_size=3, decoder_units=(4,))
-    pair, _, _ = ob.fit_two_sided(model, train, validation, CONFIG, out=out, progress=False)
-    return pair, data
+# --- the backward model ---------------------------------------------------------------------------
 
 
 def test_the_backward_model_is_one_trained_on_reversed_trajectories():
-    pair, data = trained()
+    data = ob.mask_out(dataset(8, rows=15, share=2.0), 0.6, mask="values", seed=1)
+    config = ob.TrainConfig(epochs=2, batch_size=4, optimizer="adam")
+    model = ob.make_model("gru_d", data[:5], hidden_size=3, decoder_units=(4,))
+    backward, _ = ob.fit_backward(model, data[:5], data[5:], config, progress=False)
     train, validation = (reversed_in_time(part) for part in (data[:5], data[5:]))
-    alone = ob.make_model(
-        "gru_d", train, hidden_size=3, decoder_units=(4,), scaler=pair.forward.scaler
-    )
-    ob.fit(alone, train, validation, CONFIG, progress=False)
-    for a, b in zip(alone.parameters(), pair.backward.parameters(), strict=True):
+    alone = ob.make_model("gru_d", train, hidden_size=3, decoder_units=(4,), scaler=model.scaler)
+    ob.fit(alone, train, validation, config, progress=False)
+    for a, b in zip(alone.parameters(), backward.parameters(), strict=True):
         assert a.equal(b)
-    again = fit_rule(pair.forward, pair.backward, data[5:])
-    assert np.array_equal(again.weights, pair.rule.weights)
-    assert again.counts.sum() == sum(int(masked_values(t).sum()) for t in data[5:])
-
-
-def test_a_two_sided_run_is_loaded_as_it_was_and_goes_on(tmp_path):
-    pair, data = trained(tmp_path / "run")
-    loaded = ob.load_two_sided(tmp_path / "run")
-    expected = ob.impute(pair, data)
-    ob.save_two_sided(pair, tmp_path / "copy")
-    again, _ = trained(tmp_path / "run")
-    for other in (loaded, again, ob.load_two_sided(tmp_path / "copy")):
-        for a, b in zip(expected, ob.impute(other, data), strict=True):
-            assert a.values.tobytes() == b.values.tobytes()
-    forward = ob.load_model(tmp_path / "run")
-    assert forward.config == pair.forward.config
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"gap_unit_s": 1}'])
-def test_a_damaged_rule_is_named(tmp_path, text):
-    pair, _ = trained()
-    ob.save_two_sided(pair, tmp_path)
-    (tmp_path / "two_sided.json").write_text(text)
-    with pytest.raises(ob.FileFormatError):
-        ob.load_two_sided(tmp_path)
-    (tmp_path / "two_sided.json").unlink()
-    with pytest.raises(ob.FileFormatError):
-        ob.load_two_sided(tmp_path)
-
-
-def test_a_rule_can_be_chosen_where_nothing_was_masked():
-    data = ob.Dataset(tuple(ob.Trajectory(t.times, t.values) for t in dataset(4, rows=20)))
-    forward, backward = small_model("gru", data), small_model("gru", reversed_in_time(data))
-    rule = fit_rule(forward, backward, data)
-    assert rule.counts.sum() == 4 * 3 * 6, "30 % of 20 cells, of 3 channels, of 4 trajectories"
 
 
 # --- extrapolate ----------------------------------------------------------------------------------
@@ -426,20 +236,22 @@ def test_numbers_of_targets_that_are_none_are_refused(targets):
 # --- scores ---------------------------------------------------------------------------------------
 
 
-def test_imputation_is_scored_by_its_definition_on_the_same_values_for_all():
+@pytest.mark.parametrize("mode", ["causal", "two_sided"])
+def test_imputation_is_scored_by_its_definition_on_the_same_values_for_all(mode):
     data = dataset(4, rows=20)
-    pair = pair_of(data)
-    scores = ob.score_imputation(pair, data).scores
-    assert list(scores.rmse) == ["causal", "two_sided", "last_value", "linear", "pchip"]
-    mean = pair.forward.scaler.original(np.array(pair.forward.statistics.mean))
+    blend = blend_of(data)
+    scores = ob.score_imputation(blend, data, mode=mode).scores
+    members = {"causal": ["last_value", "constant_velocity"], "two_sided": ["linear", "pchip"]}
+    assert list(scores.rmse) == ["blend", "anchored_ode_gru_d alone", *members[mode]]
+    assert scores.trivial == tuple(members[mode])
+    filled = ob.impute(blend, data, mode=mode)
     fills = {
-        "two_sided": [t.values for t in ob.impute(pair, data)],
-        "causal": [t.values for t in ob.impute(pair.forward, data)],
-        **{m: [fill(t, m, mean) for t in data] for m in fillers()},
+        "blend": [t.values for t in filled],
+        **{m: [fill(t, m, blend.stack.mean) for t in data] for m in members[mode]},
     }
     masked = [t.known & ~t.observed for t in data]
     assert scores.counts == tuple(sum(h[:, c].sum() for h in masked) for c in range(3))
-    scale = np.abs(pair.forward.scaler.scale) * np.array(pair.forward.statistics.std)
+    scale = np.abs(blend.forward.scaler.scale) * np.array(blend.forward.statistics.std)
     for name, values in fills.items():
         errors = [
             [(v[h[:, c], c] - t.values[h[:, c], c]) for t, v, h in zip(data, values, masked,
@@ -451,11 +263,18 @@ def test_imputation_is_scored_by_its_definition_on_the_same_values_for_all():
             [np.concatenate(e) / s for e, s in zip(errors, scale, strict=True)]
         )
         assert scores.overall[name] == pytest.approx(np.sqrt(np.mean(together**2)), rel=1e-12)
+    for level, share in scores.coverage.items():
+        half = [t.half_width(level) for t in filled]
+        inside = [
+            (np.abs(t.values - v.values) <= w)[h]
+            for t, v, w, h in zip(data, filled, half, masked, strict=True)
+        ]
+        assert share == pytest.approx(np.concatenate(inside).mean())
 
 
 def test_groups_of_gaps_partition_the_values_between_observations():
     data = dataset(4, rows=20)
-    result = ob.score_imputation(pair_of(data), data)
+    result = ob.score_imputation(blend_of(data), data)
     inside = 0
     for t in data:
         for c in range(3):
@@ -584,11 +403,11 @@ def test_a_log_at_the_rate_itself_gets_no_rows():
 @pytest.mark.parametrize("mode", ["causal", "two_sided"])
 def test_an_outage_of_all_sensors_is_filled_at_a_rate_and_at_times(mode):
     data = dataset(3, rows=40)
-    pair = pair_of(data, max_step=0.01)
+    blend = blend_of(data, max_step=0.01)
     times = data[0].times
     cut = ob.Dataset(tuple(replace(t, times=t.times + 2.0 * (t.times > t.times[20])) for t in data))
-    plain = ob.impute(pair, cut, mode=mode)
-    filled = ob.impute(pair, cut, mode=mode, rate_hz=25)
+    plain = ob.impute(blend, cut, mode=mode)
+    filled = ob.impute(blend, cut, mode=mode, rate_hz=25)
     for one, was, given_rows in zip(filled, plain, cut, strict=True):
         own = np.isin(one.times, given_rows.times)
         assert own.sum() == given_rows.rows
@@ -599,7 +418,7 @@ def test_an_outage_of_all_sensors_is_filled_at_a_rate_and_at_times(mode):
         seen = was.observed
         assert np.array_equal(one.values[own][seen], was.values[seen])
     asked = times[20] + np.array([0.5, 1.0, 1.5])
-    at = ob.impute(pair, cut[:1], mode=mode, times=asked)[0]
+    at = ob.impute(blend, cut[:1], mode=mode, times=asked)[0]
     assert np.isin(asked, at.times).all()
     assert at.rows == cut[0].rows + 3
 

@@ -231,10 +231,10 @@ def test_a_model_with_nothing_to_say_changes_little(with_models):
 
 
 def test_a_saved_blend_answers_the_same(with_models, tmp_path):
-    from offbeat.answers.saved import load_blend, load_predictor, save_blend
+    from offbeat.answers.saved import load_blend, load_run, save_blend
 
     save_blend(with_models, tmp_path / "run")
-    again = load_predictor(tmp_path / "run")
+    again = load_run(tmp_path / "run")
     data = ob.mask_out(waves(4, 2), 0.5, mask="bursts", burst_rows=10)
     for ask in (
         lambda b: ob.predict(b, data, times=[0.5, 0.7]),

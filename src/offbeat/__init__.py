@@ -16,9 +16,13 @@ from offbeat.errors import (
 
 if TYPE_CHECKING:
     from offbeat import baselines
+    from offbeat.answers.answer import Answer
+    from offbeat.answers.backward import fit_backward
+    from offbeat.answers.blend import Blend, fit_blend
     from offbeat.answers.forecast import forecast
     from offbeat.answers.impute import impute
     from offbeat.answers.predict import predict
+    from offbeat.answers.saved import load_run
     from offbeat.comparison import Comparison, compare
     from offbeat.data.batch import Batch
     from offbeat.data.frames import from_pandas, to_pandas
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
     from offbeat.export.exporter import export_onnx
     from offbeat.export.runner import OnnxStream
     from offbeat.kernels.backends import register_backend
+    from offbeat.learning import learn
     from offbeat.metrics import Scores
     from offbeat.models.checkpoint import load_model
     from offbeat.models.model import Model
@@ -50,7 +55,9 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 _PUBLIC = {
+    "Answer": "answers.answer",
     "Batch": "data.batch",
+    "Blend": "answers.blend",
     "Comparison": "comparison",
     "Dataset": "data.trajectory",
     "FitResult": "training",
@@ -61,18 +68,23 @@ _PUBLIC = {
     "Scores": "metrics",
     "Stream": "stream.stream",
     "StreamOptions": "stream.options",
+    "TaskConfig": "config",
     "Trajectory": "data.trajectory",
     "compare": "comparison",
     "evaluate": "evaluation",
     "export_onnx": "export.exporter",
     "fit": "training",
+    "fit_backward": "answers.backward",
+    "fit_blend": "answers.blend",
     "forecast": "answers.forecast",
     "from_pandas": "data.frames",
     "impute": "answers.impute",
     "inspect": "data.inspection",
+    "learn": "learning",
     "list_models": "models.zoo",
     "load": "data.store",
     "load_model": "models.checkpoint",
+    "load_run": "answers.saved",
     "make_model": "models.zoo",
     "mask_out": "data.masking",
     "predict": "answers.predict",
@@ -99,17 +111,13 @@ _FURTHER = {
     "Score": "metrics",
     "SweepResult": "sweeps.running",
     "THESIS_MODELS": "models.zoo",
-    "TwoSided": "answers.two_sided",
     "apply_split": "data.splits",
     "delta": "data.batch",
     "extrapolate": "answers.forecast",
-    "fit_two_sided": "answers.impute",
     "last_values": "data.batch",
-    "load_two_sided": "answers.impute",
     "read_runs": "comparison",
     "row_0_constant": "metrics",
     "save_model": "models.checkpoint",
-    "save_two_sided": "answers.impute",
     "score_forecast": "answers.scoring",
     "score_imputation": "answers.scoring",
     "split_in_time": "data.splits",
@@ -122,6 +130,10 @@ _RENAMED = {
     "PartsConfig": "SplitConfig",
     "RecurrentModel": "Model",
     "StreamPolicies": "StreamOptions",
+    "TwoSided": "Blend",
+    "fit_two_sided": "learn, or fit, fit_backward and fit_blend",
+    "load_two_sided": "load_run",
+    "save_two_sided": "Blend.save",
     "load_checkpoint": "load_model",
     "make": "make_model",
     "parts": "offbeat.data.splits.apply_split",
@@ -133,7 +145,9 @@ _RENAMED = {
 """Names of 0.1.0 and their replacements."""
 
 __all__ = [
+    "Answer",
     "Batch",
+    "Blend",
     "Comparison",
     "Dataset",
     "DivergenceError",
@@ -151,6 +165,7 @@ __all__ = [
     "SplitConfig",
     "Stream",
     "StreamOptions",
+    "TaskConfig",
     "TrainConfig",
     "Trajectory",
     "baselines",
@@ -158,13 +173,17 @@ __all__ = [
     "evaluate",
     "export_onnx",
     "fit",
+    "fit_backward",
+    "fit_blend",
     "forecast",
     "from_pandas",
     "impute",
     "inspect",
+    "learn",
     "list_models",
     "load",
     "load_model",
+    "load_run",
     "make_model",
     "mask_out",
     "predict",

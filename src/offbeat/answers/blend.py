@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from offbeat.answers.both_sides import (
     reversed_in_time,
 )
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
-from offbeat.baselines.base import Array
+from offbeat.baselines.base import BASELINES, Array, causal_baselines
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.stack import (
     LEVELS,
@@ -44,11 +45,9 @@ from offbeat.data.transforms import Transforms
 from offbeat.models.base import BaseModel, of_channels
 from offbeat.tables import plain
 
-CAUSAL_MEMBERS = ("last_value", "constant_velocity", "damped_slope", "mean", "running_mean")
-"""Causal baselines of a blend."""
-
-TWO_SIDED_MEMBERS = ("last_value", "linear", "pchip")
-"""Baselines of the fills of a blend."""
+GIVEN_CAUSAL = {"logged": 0.5, "cut": 0.5}
+GIVEN_TWO_SIDED = {"logged": 1.0}
+"""Shares of tasks for data that has masks of its own."""
 
 FARTHEST = 1e6
 """Observed values are limited to this many deviations from the mean, so that squares are finite."""
@@ -230,6 +229,16 @@ class Blend:
             lines.append([name, *(f"{g:.2f}" for g in usual[:, c])])
         return plain(lines)
 
+    def save(self, path: str | Path) -> None:
+        """Writes the blend and its models to a folder; `load_run` reads it.
+
+        Args:
+            path: the folder.
+        """
+        from offbeat.answers.saved import save_blend
+
+        save_blend(self, path)
+
     def arrays(self) -> dict[str, Array]:
         """All tables, by name; models are not among them."""
         own = {"gamma": self.gamma, "widths": self.widths.table, "widths_count": self.widths.count}
@@ -258,8 +267,9 @@ def fit_blend(
     backward: BaseModel | None = None,
     *,
     tasks: TaskConfig | None = None,
-    causal: Sequence[str] = CAUSAL_MEMBERS,
-    two_sided: Sequence[str] = TWO_SIDED_MEMBERS,
+    causal: Sequence[str] | None = None,
+    two_sided: Sequence[str] | None = None,
+    masks_of_data: bool = False,
     count: int = TASKS,
     seed: int = 0,
 ) -> Blend:
@@ -272,8 +282,10 @@ def fit_blend(
         backward: trained on reversed trajectories; without one, a fill from both sides uses the
             forward model's causal predictions alone.
         tasks: how tasks are drawn; by default with a horizon of sixteen typical gaps.
-        causal: names of the causal baselines.
-        two_sided: names of the baselines of fills.
+        causal: names of the causal baselines; by default all that are registered.
+        two_sided: names of the baselines of fills from both sides, likewise.
+        masks_of_data: the data has masked values like those that will be asked for, so that no
+            others are masked than those after a cut.
         count: tasks that are drawn from each part, at most.
         seed: of the tasks.
 
@@ -303,7 +315,11 @@ def fit_blend(
             for i, part in enumerate((train, validation))
         ]
 
-    parts = drawn(CAUSAL, 0)
+    before, both = (GIVEN_CAUSAL, GIVEN_TWO_SIDED) if masks_of_data else (CAUSAL, TWO_SIDED)
+    causal = causal_baselines() if causal is None else causal
+    if two_sided is None:
+        two_sided = tuple(name for name, kind in BASELINES.items() if not kind.causal)
+    parts = drawn(before, 0)
     stack, cells, held_out = fit_stack(causal, *parts, span_s=span, gap_s=gap)
     models = model_rows(model, parts[1], seed=seed)
     count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
@@ -335,7 +351,7 @@ def fit_blend(
             [a.values for a in blend.causal(part, seed=seed)],
             model_fills(model, backward, part, seed=seed),
         )
-        for part in drawn(TWO_SIDED, 1)
+        for part in drawn(both, 1)
     ]
     return replace(
         blend, both=fit_both_sides(two_sided, sides[0], sides[1], span_s=span, gap_s=gap)

@@ -119,7 +119,7 @@ def load_blend(path: str | Path) -> Blend:
         ) from None
 
 
-def load_predictor(path: str | Path) -> BaseModel | Blend:
+def load_run(path: str | Path) -> BaseModel | Blend:
     """Reads the blend of a folder, or its model where there is no blend.
 
     Args:

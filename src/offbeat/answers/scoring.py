@@ -16,7 +16,6 @@ from offbeat.answers.blend import Blend, model_fills, model_rows
 from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
 from offbeat.answers.predict import check_any_time
-from offbeat.answers.two_sided import TwoSided
 from offbeat.baselines import Baseline, fill, fillers, forecasters
 from offbeat.baselines.history import typical_gap
 from offbeat.data.masking import masked_values
@@ -298,7 +297,7 @@ def score_one_step(model: BaseModel | Blend, dataset: Dataset, *, seed: int = 0)
 
 
 def score_imputation(
-    model: BaseModel | Blend | TwoSided,
+    model: BaseModel | Blend,
     dataset: Dataset,
     *,
     mode: str | None = None,
@@ -419,10 +418,9 @@ def forecast_tasks(
 _Predictions = Mapping[str, list[NDArray[np.float64]]]
 
 
-def _prepared(model: BaseModel | Blend | TwoSided, dataset: Dataset) -> Dataset:
-    made: BaseModel | Blend = model.forward if isinstance(model, TwoSided) else model
-    dataset = of_channels(Dataset.of(dataset), made.names, made.units)
-    return made.transforms.apply(dataset)
+def _prepared(model: BaseModel | Blend, dataset: Dataset) -> Dataset:
+    dataset = of_channels(Dataset.of(dataset), model.names, model.units)
+    return model.transforms.apply(dataset)
 
 
 def _scored(
@@ -460,7 +458,7 @@ def _scored(
 
 
 def _fills(
-    model: BaseModel | Blend | TwoSided, dataset: Dataset, mode: str, seed: int
+    model: BaseModel | Blend, dataset: Dataset, mode: str, seed: int
 ) -> tuple[_Predictions, list[Answer] | None, tuple[str, ...]]:
     """Fills of each predictor, answers with intervals, and which predictors are baselines."""
     if isinstance(model, Blend):
@@ -482,11 +480,8 @@ def _fills(
             answers,
             tuple(members),
         )
-    forward = model.forward if isinstance(model, TwoSided) else model
-    result = {"causal": [t.values for t in impute(forward, dataset, seed=seed)]}
-    if isinstance(model, TwoSided):
-        result["two_sided"] = [t.values for t in impute(model, dataset, seed=seed)]
-    mean = training_mean(forward)
+    result = {"causal": [t.values for t in impute(model, dataset, seed=seed)]}
+    mean = training_mean(model)
     for method in fillers():
         result[method] = [fill(t, method, mean) for t in dataset]
     return result, None, fillers()
@@ -500,9 +495,8 @@ def training_mean(model: BaseModel | Blend) -> list[float]:
     return mean
 
 
-def _sums_for(model: BaseModel | Blend | TwoSided) -> ErrorSums:
-    made = model.forward if isinstance(model, TwoSided) else model
-    return ErrorSums(made.names, made.units, channel_scale(made))
+def _sums_for(model: BaseModel | Blend) -> ErrorSums:
+    return ErrorSums(model.names, model.units, channel_scale(model))
 
 
 def channel_scale(model: BaseModel | Blend) -> NDArray[np.float64]:

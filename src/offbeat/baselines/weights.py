@@ -123,7 +123,9 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     shape = (errors.keys, channels, predictors, predictors)
     many = np.maximum(effective, 1e-12)[..., None, None]
     mean = gram.reshape(shape) / many
-    mean_still = still.reshape(shape) / many
+    moved = np.bincount(place, weight * errors.truth**2, minlength=size).reshape(shape[:2])
+    # In units of what the channel moves, so that they never outweigh what is well predicted.
+    mean_still = still.reshape(shape) / np.maximum(moved, 1e-12)[..., None, None]
     # Channels are pooled relative to the error of their best predictor.
     smallest = np.einsum("kcjj->kcj", mean).min(axis=2)
     relative = 1.0 / np.maximum(smallest, 1e-12)[..., None, None]
@@ -139,7 +141,7 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     for key in range(errors.keys):
         prior = POOLED * min(1.0, float(total[key, 0, 0])) * pooled[key]
         for c in range(channels):
-            rest = STILL * mean_still[key, c] * relative[key, c] if effective[key, c] else 0.0
+            rest = STILL * mean_still[key, c] if effective[key, c] else 0.0
             weights[key, c] = on_simplex(effective[key, c] * own[key, c] + prior + rest)
     return weights
 

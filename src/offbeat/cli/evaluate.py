@@ -62,14 +62,13 @@ def evaluate_command(
     """
     from offbeat.answers.blend import Blend
     from offbeat.answers.forecast import checked_horizons
-    from offbeat.answers.impute import load_run
+    from offbeat.answers.saved import load_run
     from offbeat.cli.scored import fill_figure, scored
     from offbeat.data.masking import mask_out
     from offbeat.data.redundant import leave_out_of
     from offbeat.data.splits import load_split
     from offbeat.evaluation import evaluate
     from offbeat.files import write_json
-    from offbeat.models.base import BaseModel
 
     if part is not None:
         one_of("part", part, ("train", "validation", "test", "all"))
@@ -78,10 +77,9 @@ def evaluate_command(
     check_figure(figure)
     after = None if horizons is None else checked_horizons(horizons).tolist()
     loaded = load_run(model)
-    forward = loaded if isinstance(loaded, BaseModel) else loaded.forward
-    made = loaded if isinstance(loaded, BaseModel | Blend) else loaded.forward
+    forward = loaded.forward if isinstance(loaded, Blend) else loaded
     # As in training, where these channels were not masked.
-    dataset = leave_out_of(read_log(data, reader, run=model), made.transforms)
+    dataset = leave_out_of(read_log(data, reader, run=model), loaded.transforms)
     own = load_split(model / "split.json", dataset)
     if own is None and part not in (None, "all"):
         raise InputError(
@@ -107,7 +105,7 @@ def evaluate_command(
                 burst_s=burst_s,
                 seed=seed,
             )
-    chosen = plotted_channels(made.names, channels)
+    chosen = plotted_channels(loaded.names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = None if forward is None else evaluate(forward, dataset, seed=seed)
     scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)

@@ -48,7 +48,7 @@ def forecast_command(
     import numpy as np
 
     from offbeat.answers.forecast import checked_horizons, forecast
-    from offbeat.answers.saved import load_predictor
+    from offbeat.answers.saved import load_run
     from offbeat.cli.scored import forecast_figure
     from offbeat.data.writers.tables import write_table
 
@@ -59,7 +59,7 @@ def forecast_command(
     check_out(out, data)
     check_figure(figure)
     after = checked_horizons(horizons)
-    loaded = load_predictor(model)
+    loaded = load_run(model)
     dataset = read_log(data, reader, run=model)
     predicted = forecast(loaded, dataset, after)
     chosen = plotted_channels(predicted.names, channels)

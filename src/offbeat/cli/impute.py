@@ -52,7 +52,8 @@ def impute_command(
         seed: of models with self-feeding.
         json: print what was written as JSON.
     """
-    from offbeat.answers.impute import impute, load_run
+    from offbeat.answers.impute import impute
+    from offbeat.answers.saved import load_run
     from offbeat.cli.scored import fill_figure
     from offbeat.data.writers.tables import write_table
 

@@ -46,7 +46,7 @@ def predict_command(
         json: print what was written as JSON.
     """
     from offbeat.answers.predict import predict
-    from offbeat.answers.saved import load_predictor
+    from offbeat.answers.saved import load_run
     from offbeat.data.writers.tables import write_table
 
     check_out(out, data)
@@ -57,7 +57,7 @@ def predict_command(
         reader = {**reader_options(reader, model), "time_unit": time_unit}
     if isinstance(times, float):
         times = [times]
-    loaded = load_predictor(model)
+    loaded = load_run(model)
     dataset = read_log(data, reader, run=model)
     if times is not None:
         _check_since(dataset, times)

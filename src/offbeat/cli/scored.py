@@ -21,7 +21,6 @@ from offbeat.answers.scoring import (
     score_one_step,
     training_mean,
 )
-from offbeat.answers.two_sided import TwoSided
 from offbeat.data.masking import masked_values
 from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset, Trajectory
@@ -32,7 +31,7 @@ from offbeat.plots.figures import save
 
 
 def scored(
-    model: BaseModel | Blend | TwoSided,
+    model: BaseModel | Blend,
     dataset: Dataset,
     evaluation: Evaluation | None,
     *,
@@ -61,8 +60,7 @@ def scored(
         text += ["", "masked values filled, RMSE in the channels' units:", imputed.table()]
         verdicts.append(imputed.verdict())
     if horizons is not None:
-        forward = model.forward if isinstance(model, TwoSided) else model
-        ahead_of = score_forecast(forward, dataset, horizons)
+        ahead_of = score_forecast(model, dataset, horizons)
         result["extrapolation"] = [
             {"horizon_s": float(h), **s.to_dict()} for h, s in zip(horizons, ahead_of, strict=True)
         ]
@@ -142,7 +140,7 @@ def overview(tasks: Sequence[ChannelScores]) -> str:
 
 
 def fill_figure(
-    model: BaseModel | Blend | TwoSided,
+    model: BaseModel | Blend,
     dataset: Dataset,
     path: Path,
     channels: Sequence[str],
@@ -164,12 +162,11 @@ def fill_figure(
         rate_hz: as of `impute`.
         seed: of models with self-feeding.
     """
-    forward = model.forward if isinstance(model, TwoSided) else model
-    truth = dataset.select(forward.names)[number]
+    truth = dataset.select(model.names)[number]
     one = replace(dataset, trajectories=(dataset[number],))
     filled = impute(model, one, mode=mode, rate_hz=rate_hz, seed=seed)  # type: ignore[arg-type]
-    drawn = {"last_value": _filled(truth, "last_value", forward)}
-    drawn |= {name: _filled(truth, name, forward) for name in ("linear", "pchip")}
+    drawn = {"last_value": _filled(truth, "last_value", model)}
+    drawn |= {name: _filled(truth, name, model) for name in ("linear", "pchip")}
     drawn[str(filled.meta["filled"])] = filled[0]
     save(answers(truth, drawn, channels, title=truth.origin), path)
 

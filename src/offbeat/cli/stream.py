@@ -60,11 +60,11 @@ def stream_command(
     else:
         import torch
 
-        from offbeat.answers.saved import load_predictor
+        from offbeat.answers.saved import load_run
         from offbeat.stream.stream import Stream
 
         torch.set_num_threads(1)
-        stream = Stream(load_predictor(model), options, time_unit=time_unit, seed=seed)
+        stream = Stream(load_run(model), options, time_unit=time_unit, seed=seed)
     if state is not None and state.exists():
         try:
             stream.restore(read_json(state))

@@ -151,7 +151,7 @@ def plan(
             + ("; ..." if len(sensors) > 4 else "")
         )
     ladder = [float(f"{f * horizon:.3g}") for f in (0.1, 0.2, 0.5, 1.0)]
-    parts = apply_split(clean, _whole(split))
+    parts = apply_split(clean, whole(split))
     if split is found and split.mask == "dropout":
         split = replace(split, sensors=sensors)
     return Plan(
@@ -467,7 +467,7 @@ def _most_alike(dataset: Dataset, split: SplitConfig) -> SplitConfig:
     for k in range(tries):
         tried = replace(split, seed=(split.seed + 1000 * k) % 2**32)
         try:
-            unlike = unlikeness(*apply_split(dataset, _whole(tried)))
+            unlike = unlikeness(*apply_split(dataset, whole(tried)))
         except InputError:  # a part is empty
             continue
         if least is None or unlike < least:
@@ -477,7 +477,7 @@ def _most_alike(dataset: Dataset, split: SplitConfig) -> SplitConfig:
     return best
 
 
-def _whole(split: SplitConfig) -> SplitConfig:
+def whole(split: SplitConfig) -> SplitConfig:
     """The split without windows and masks."""
     return replace(
         split,
@@ -495,7 +495,7 @@ def _whole(split: SplitConfig) -> SplitConfig:
 
 def _never_trained(dataset: Dataset, split: SplitConfig) -> tuple[str, ...]:
     """States that have a value, but none in the training part."""
-    train, _, _ = apply_split(dataset, _whole(split))
+    train, _, _ = apply_split(dataset, whole(split))
     seen = np.any([t.observed.any(axis=0) for t in train], axis=0)
     return tuple(
         name

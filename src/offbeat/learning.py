@@ -1,0 +1,190 @@
+"""`learn`: everything from a log to a blend with intervals, in one call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from offbeat.answers.backward import fit_backward
+from offbeat.answers.blend import Blend, fit_blend
+from offbeat.answers.saved import BACKWARD, save_blend
+from offbeat.baselines.history import typical_gap
+from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig, check_seed
+from offbeat.data.masking import masked_values
+from offbeat.data.plan import Plan, plan, prepare, whole
+from offbeat.data.scaler import Scaler, ScalerKind
+from offbeat.data.splits import apply_split
+from offbeat.data.trajectory import Dataset
+from offbeat.ladder import CANDIDATES, fit_ladder
+from offbeat.models.base import BaseModel
+from offbeat.models.zoo import make_model
+from offbeat.training import FitResult, fit
+
+BUDGET_S = 240.0
+"""s, default time for the trainings of a log, on one thread."""
+
+_FORWARD_SHARE = 0.7
+"""Part of the budget for the ladder and the forward model; the rest is for the backward one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """The result of `learn`.
+
+    Attributes:
+        blend: answers predictions, fills and forecasts.
+        train: training part, prepared.
+        validation: validation part.
+        test: test part; nothing was fitted to it.
+        split: how the parts were made.
+        fit: the training of the forward model.
+        chosen: what was chosen for the log; None for a data set that is taken as it is.
+        notes: sentences on what was chosen, and on what to beware of.
+    """
+
+    blend: Blend
+    train: Dataset
+    validation: Dataset
+    test: Dataset
+    split: SplitConfig
+    fit: FitResult
+    chosen: Plan | None
+    notes: tuple[str, ...]
+
+
+def learn(
+    dataset: Dataset,
+    out: str | Path | None = None,
+    *,
+    horizon_s: float | None = None,
+    model: str | ModelConfig | None = None,
+    training: TrainConfig | None = None,
+    split: SplitConfig | None = None,
+    chosen: Plan | None = None,
+    as_it_is: bool = False,
+    two_sided: bool = True,
+    scaler: ScalerKind | Scaler | None = None,
+    budget_s: float = BUDGET_S,
+    seed: int = 0,
+    device: str | None = None,
+    progress: bool = True,
+) -> Learned:
+    """Cleans and splits a log, trains models for what will be asked, and blends them.
+
+    Without further options, sensors, horizon, windows and split are found in the log (see
+    `offbeat.data.plan`), a few models are tried and the best on validation is trained forward and
+    backward on tasks, and baselines, models and intervals are blended (see `fit_blend`).
+
+    Args:
+        dataset: as read.
+        out: folder of the run; one that was stopped is resumed.
+        horizon_s: s, the longest forecast that will be asked for; by default found in the log.
+        model: to train; by default the best of a few is chosen on validation.
+        training: options of the training that differ from the recipe.
+        split: to be used as it is; by default found in the log.
+        chosen: from `plan`, for a data set that is prepared already.
+        as_it_is: train on the windows and masks of `split`, instead of tasks that are drawn anew in
+            each epoch: for a data set that has masks of its own.
+        two_sided: train a backward model, for fills from both sides.
+        scaler: of the models; by default robust, and standardise for a data set as it is.
+        budget_s: s, time for the trainings on one thread of this machine, about. The number of
+            epochs follows from it and from the time of a step; a model that is given is trained by
+            its recipe.
+        seed: of the initial weights, and of tasks.
+        device: as of `fit`.
+        progress: show progress bars.
+
+    Returns:
+        The blend, the parts of the data, and notes.
+
+    Raises:
+        InputError: nothing can be learned from the data, or an option is out of range.
+
+    Example:
+        >>> learned = learn(offbeat.read("arm.csv"), "runs/arm")  # doctest: +SKIP
+        >>> offbeat.forecast(learned.blend, log, 0.5)[0].interval(0.9)  # doctest: +SKIP
+    """
+    dataset = Dataset.of(dataset)
+    check_seed(seed)
+    folder = Path(out) if out is not None else None
+    if chosen is None and not as_it_is:
+        chosen = plan(dataset, horizon_s=horizon_s, split=split, seed=seed)
+        dataset = prepare(dataset, chosen)
+    split = (
+        chosen.split if chosen is not None and split is None else split or SplitConfig(seed=seed)
+    )
+    if not as_it_is:
+        split = replace(
+            split, observed_fraction=None, mask="rows", sensors=None, burst_rows=None, burst_s=None
+        )
+    train, validation, test = apply_split(dataset, split)
+    if not as_it_is:
+        train, validation, _ = apply_split(dataset, whole(split))
+    kind: Any = scaler or ("standardise" if as_it_is else "robust")
+    tasks = _tasks(chosen, train, horizon_s)
+    common: dict[str, Any] = {"device": device, "progress": progress}
+    config = training or TrainConfig(seed=seed)
+    if not as_it_is:
+        config = replace(config, tasks=tasks)
+    notes = [] if chosen is None else [*chosen.notes]
+    forward: BaseModel
+    if model is None and not as_it_is:
+        result = fit_ladder(
+            train,
+            validation,
+            config,
+            candidates=CANDIDATES,
+            budget_s=_FORWARD_SHARE * budget_s if two_sided else budget_s,
+            out=folder,
+            scaler=kind,
+            seed=seed,
+            **common,
+        )
+        forward, fitted = result.model, result.fit
+        config = replace(config, epochs=len(fitted.history))
+        notes.append(result.summary())
+    else:
+        forward = make_model(model or "anchored_ode_gru_d", train, scaler=kind, seed=seed)
+        fitted = fit(forward, train, validation, config, out=folder, **common)
+    backward = None
+    if two_sided:
+        backward, _ = fit_backward(
+            forward,
+            train,
+            validation,
+            config,
+            out=None if folder is None else folder / BACKWARD,
+            seed=seed,
+            **common,
+        )
+    masked = any(masked_values(t).any() for t in train)
+    blend = fit_blend(
+        train,
+        validation,
+        forward,
+        backward,
+        tasks=tasks,
+        masks_of_data=as_it_is and masked,
+        seed=seed,
+    )
+    if folder is not None:
+        save_blend(blend, folder)
+    return Learned(blend, train, validation, test, split, fitted, chosen, tuple(notes))
+
+
+def _tasks(chosen: Plan | None, train: Dataset, horizon_s: float | None) -> TaskConfig:
+    if chosen is not None:
+        return TaskConfig(
+            horizon_s=chosen.horizon_s,
+            gap_s=chosen.typical_gap_s,
+            window_s=chosen.window_s,
+            sensors=chosen.sensors,
+        )
+    gap = typical_gap(train)
+    longest = max(float(t.times[-1] - t.times[0]) for t in train)
+    return TaskConfig(
+        horizon_s=horizon_s or max(min(16 * gap, longest / 4), gap),
+        gap_s=gap,
+        window_s=max(longest, gap),
+    )
