@@ -324,7 +324,7 @@ def fit_blend(
     models = model_rows(model, parts[1], seed=seed)
     count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
     base = stack.predict(parts[1])
-    errors = errors_of(cells, [held_out, base], count_of)
+    errors = errors_of(cells, [held_out, base], count_of, stack.keys.groups)
     gamma, answer = gated(
         errors,
         errors.predictions[:, 0],

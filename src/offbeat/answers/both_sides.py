@@ -129,6 +129,13 @@ class SideKeys:
         key = np.where(sides.after & ~sides.before, at + 3 * many, key)
         return np.where(sides.before | sides.after, key, 4 * many).astype(np.int64)
 
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """(keys,) group of each kind: a length between observations, or one outside them."""
+        many = len(self.bins)
+        inside, outside = np.arange(many), many + np.arange(many)
+        return np.concatenate([inside, inside, outside, outside, [2 * many]])
+
     def lengths(self) -> Array:
         """(keys,) s."""
         return np.append(np.tile(self.bins.edges, 4), np.inf)
@@ -330,7 +337,13 @@ def _errors(
             columns["model"].append((models[i][row, channel] - zero) / unit)
     flat = {name: np.concatenate(parts) for name, parts in columns.items() if parts}
     errors = Errors(
-        flat["key"], flat["channel"], flat["task"], flat["truth"], np.concatenate(each), count
+        flat["key"],
+        flat["channel"],
+        flat["task"],
+        flat["truth"],
+        np.concatenate(each),
+        count,
+        keys.groups,
     )
     return errors, flat.get("model")
 

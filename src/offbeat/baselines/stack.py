@@ -113,6 +113,11 @@ class Keys:
         last = History.last(state, as_kind(self.local.slope.mean, square))
         return xp.stack([key, square, age, last], -1)
 
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """(keys,) group of each kind: its bin of the time since observation."""
+        return np.append(np.repeat(np.arange(len(self.bins)), LEVELS), len(self.bins))
+
     def ages(self) -> Array:
         """(keys,) s, upper end of the bin; infinite for the last kind."""
         return np.append(np.repeat(self.bins.edges, LEVELS), np.inf)
@@ -331,7 +336,10 @@ def fit_stack(
         later.append(member.predict(validation))
     count = independent_tasks(stack.keys.ages(), span_s, gap_s)
     cells = [stack.keys.cells(tasks) for tasks in (train, validation)]
-    errors = [errors_of(c, p, count) for c, p in zip(cells, (predicted, later), strict=True)]
+    errors = [
+        errors_of(c, p, count, stack.keys.groups)
+        for c, p in zip(cells, (predicted, later), strict=True)
+    ]
     stack.weights = simplex_weights(errors[0], train.channels)
     held_out = stack.mix(later, validation)
     stack.weights = simplex_weights(joined(errors), train.channels)
@@ -348,6 +356,7 @@ def joined(errors: Sequence[Errors]) -> Errors:
         np.concatenate([e.truth for e in errors]),
         np.concatenate([e.predictions for e in errors]),
         errors[0].count,
+        errors[0].group,
     )
 
 
@@ -360,13 +369,16 @@ def bounds(dataset: Dataset) -> tuple[Array, Array]:
     return np.where(seen, low - margin, 0.0), np.where(seen, high + margin, 0.0)
 
 
-def errors_of(cells: Cells, predicted: Sequence[Sequence[Array]], count: Array) -> Errors:
+def errors_of(
+    cells: Cells, predicted: Sequence[Sequence[Array]], count: Array, group: NDArray[np.int64]
+) -> Errors:
     """Errors of predictors, for `simplex_weights` and `gate`.
 
     Args:
         cells: values of tasks.
         predicted: per predictor and trajectory (rows, channels).
         count: (keys,) independent tasks.
+        group: (keys,) group of each key.
     """
     return Errors(
         cells.key,
@@ -375,4 +387,5 @@ def errors_of(cells: Cells, predicted: Sequence[Sequence[Array]], count: Array) 
         (cells.truth - cells.last) / cells.unit,
         np.stack([cells.pick(p) for p in predicted], axis=1),
         count,
+        group,
     )

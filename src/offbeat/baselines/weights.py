@@ -45,6 +45,7 @@ class Errors:
         truth: the value, in units of `size` after subtracting `last`.
         predictions: (values, predictors) the same of each prediction.
         count: independent tasks per key, at most.
+        group: group of each key; kinds of one group are alike. By default each is its own.
     """
 
     key: Integers
@@ -53,6 +54,12 @@ class Errors:
     truth: Array
     predictions: Array
     count: Array
+    group: Integers | None = None
+
+    @property
+    def groups(self) -> Integers:
+        """(keys,) group of each key."""
+        return np.arange(self.keys) if self.group is None else self.group
 
     @property
     def keys(self) -> int:
@@ -68,6 +75,7 @@ class Errors:
             self.truth[chosen],
             self.predictions[chosen],
             self.count,
+            self.group,
         )
 
 
@@ -133,17 +141,38 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     own = np.where(seen, mean * relative, 0.0)
     large = np.einsum("kcjj->kcj", own)
     shrink = np.sqrt(np.minimum(1.0, WORST / np.maximum(large, 1e-12)))
-    shared = own * shrink[..., :, None] * shrink[..., None, :]
-    pooled = (effective[..., None, None] * shared).sum(axis=1)
-    total = effective.sum(axis=1)[:, None, None]
-    pooled = pooled / np.maximum(total, 1e-12)
+    shared = effective[..., None, None] * own * shrink[..., :, None] * shrink[..., None, :]
+    near = _pooled(shared, effective, errors.groups)
     weights = np.empty((errors.keys, channels, predictors))
     for key in range(errors.keys):
-        prior = POOLED * min(1.0, float(total[key, 0, 0])) * pooled[key]
         for c in range(channels):
             rest = STILL * mean_still[key, c] if effective[key, c] else 0.0
+            prior = POOLED * near[key, c]
             weights[key, c] = on_simplex(effective[key, c] * own[key, c] + prior + rest)
     return weights
+
+
+def _pooled(shared: Array, effective: Array, groups: Integers) -> Array:
+    """Mean Gram matrices of what is like a key and channel: the same shape as `shared`.
+
+    The channel in all kinds of the group, and all channels in this kind, half each; where there is
+    neither, all channels of the group; where that is empty, the group before.
+    """
+    mean = np.zeros_like(shared)
+    before = np.zeros(shared.shape[2:])
+    for group in range(int(groups.max(initial=0)) + 1):
+        keys = np.flatnonzero(groups == group)
+        total = effective[keys].sum()
+        every = shared[keys].sum(axis=(0, 1)) / total if total else before
+        before = every
+        for key in keys:
+            here = effective[key].sum()
+            kind = shared[key].sum(axis=0) / here if here else every
+            for c in range(shared.shape[1]):
+                own = effective[keys, c].sum()
+                channel = shared[keys, c].sum(axis=0) / own if own else every
+                mean[key, c] = (kind + channel) / 2
+    return mean
 
 
 def on_simplex(gram: Array) -> Array:
