@@ -12,11 +12,11 @@ from offbeat.answers.saved import BACKWARD, save_blend
 from offbeat.baselines.history import typical_gap
 from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig, check_seed
 from offbeat.data.masking import masked_values
-from offbeat.data.plan import Plan, plan, prepare, whole
+from offbeat.data.plan import Plan, plan, prepare
 from offbeat.data.scaler import Scaler, ScalerKind
 from offbeat.data.splits import apply_split
 from offbeat.data.trajectory import Dataset
-from offbeat.ladder import CANDIDATES, fit_ladder
+from offbeat.ladder import CANDIDATES, LadderResult, fit_ladder
 from offbeat.models.base import BaseModel
 from offbeat.models.zoo import make_model
 from offbeat.training import FitResult, fit
@@ -111,16 +111,21 @@ def learn(
     if chosen is None and not as_it_is:
         chosen = plan(dataset, horizon_s=horizon_s, split=split, seed=seed)
         dataset = prepare(dataset, chosen)
-    split = (
-        chosen.split if chosen is not None and split is None else split or SplitConfig(seed=seed)
-    )
-    if not as_it_is:
+    if chosen is None or as_it_is:
+        split = split or SplitConfig(seed=seed)
+        train, validation, test = apply_split(dataset, split)
+    else:
+        # Tasks are drawn from whole parts; the test part is in windows, as other commands make it.
         split = replace(
-            split, observed_fraction=None, mask="rows", sensors=None, burst_rows=None, burst_s=None
+            chosen.split,
+            observed_fraction=None,
+            mask="rows",
+            sensors=None,
+            burst_rows=None,
+            burst_s=None,
         )
-    train, validation, test = apply_split(dataset, split)
-    if not as_it_is:
-        train, validation, _ = apply_split(dataset, whole(split))
+        train, validation, _ = apply_split(dataset, chosen.whole)
+        test = apply_split(dataset, split)[2]
     kind: Any = scaler or ("standardise" if as_it_is else "robust")
     tasks = _tasks(chosen, train, horizon_s)
     common: dict[str, Any] = {"device": device, "progress": progress}
@@ -143,7 +148,7 @@ def learn(
         )
         forward, fitted = result.model, result.fit
         config = replace(config, epochs=len(fitted.history))
-        notes.append(result.summary())
+        notes.append(_said(result))
     else:
         forward = make_model(model or "anchored_ode_gru_d", train, scaler=kind, seed=seed)
         fitted = fit(forward, train, validation, config, out=folder, **common)
@@ -173,14 +178,18 @@ def learn(
     return Learned(blend, train, validation, test, split, fitted, chosen, tuple(notes))
 
 
+def _said(result: LadderResult) -> str:
+    trials = ", ".join(f"{t.candidate.label} {t.score:.3g}" for t in result.trials)
+    return (
+        f"models after {result.trial_epochs} epochs, mean log of their MSE by that of the best "
+        f"baseline on validation: {trials}; {result.trials[result.chosen].candidate.label} was "
+        f"trained further, to {result.score:.3g}"
+    )
+
+
 def _tasks(chosen: Plan | None, train: Dataset, horizon_s: float | None) -> TaskConfig:
     if chosen is not None:
-        return TaskConfig(
-            horizon_s=chosen.horizon_s,
-            gap_s=chosen.typical_gap_s,
-            window_s=chosen.window_s,
-            sensors=chosen.sensors,
-        )
+        return chosen.tasks
     gap = typical_gap(train)
     longest = max(float(t.times[-1] - t.times[0]) for t in train)
     return TaskConfig(

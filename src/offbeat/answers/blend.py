@@ -52,6 +52,9 @@ GIVEN_TWO_SIDED = {"logged": 1.0}
 FARTHEST = 1e6
 """Observed values are limited to this many deviations from the mean, so that squares are finite."""
 
+LARGEST = 4e6
+"""Values in the tasks that are drawn from a part, about, at most."""
+
 TASKS = 800
 """Tasks that are drawn from the training data and from the validation data, at most."""
 
@@ -115,7 +118,7 @@ class Blend:
         every = zip(dataset, self.stack.predict(dataset), kinds, strict=True)
         for i, (trajectory, base, kind) in enumerate(every):
             values, beyond = self.corrected(base, None if models is None else models[i], kind)
-            key, unit = kind[..., 0].astype(np.int64), self._unit(kind)
+            key, unit = kind[..., 0].astype(np.int64), self.stack.keys.unit(kind)
             answers.append(self._answer(trajectory, values, self.widths, key, unit, beyond))
         return answers
 
@@ -147,11 +150,9 @@ class Blend:
             kind: (rows, channels, 4) of `Keys.read`.
             level: probability of the interval.
         """
-        return half_width(self.widths.at(kind[..., 0].astype(np.int64), self._unit(kind)), level)
-
-    def _unit(self, kind: Array) -> Array:
-        units = self.stack.keys.units()[kind[..., 0].astype(np.int64), np.arange(self.channels)]
-        return np.asarray(units * kind[..., 1] ** 0.25)
+        return half_width(
+            self.widths.at(kind[..., 0].astype(np.int64), self.stack.keys.unit(kind)), level
+        )
 
     def limited(self, values: Array) -> Array:
         """Values that are finite in all computations: within `FARTHEST` deviations of the mean."""
@@ -359,9 +360,18 @@ def fit_blend(
 
 
 def number_of_tasks(part: Dataset, config: TaskConfig, most: int) -> int:
-    """Tasks that cover a part about four times, from 100 to `most`."""
+    """Tasks that cover a part about four times, from 100 to `most`; fewer of very large ones.
+
+    Args:
+        part: that they are drawn from.
+        config: how.
+        most: largest number.
+    """
     span = sum(float(t.times[-1] - t.times[0]) for t in part)
-    return int(np.clip(4 * span / config.length_s, min(100, most), most))
+    rows = sum(t.rows for t in part)
+    values = rows * part.channels * min(config.length_s / max(span, 1e-12), 1.0)
+    wanted = np.clip(4 * span / config.length_s, min(100, most), most)
+    return int(max(min(wanted, LARGEST / max(values, 1.0)), min(30, most)))
 
 
 def model_rows(

@@ -245,7 +245,9 @@ def fit_both_sides(
         gap_s: s, its typical gap.
     """
     channels = train.tasks.channels
-    keys = SideKeys(AgeBins.of_lengths(gap_s, longest_length(train.tasks)))
+    lengths = longest_lengths(train.tasks)
+    usual = float(np.quantile(lengths, 0.95)) if lengths else gap_s
+    keys = SideKeys(AgeBins.of_lengths(gap_s, usual, max(lengths, default=gap_s)))
     fitted, predicted, later = {}, [], []
     for name in members:
         fitted[name] = fit_baseline(name, train.tasks)
@@ -301,14 +303,14 @@ def gated(
     return gamma, answer
 
 
-def longest_length(tasks: Dataset) -> float:
-    """The longest length of a gap with masked values, in s."""
-    longest = 0.0
+def longest_lengths(tasks: Dataset) -> list[float]:
+    """The longest length of a gap with masked values, per trajectory, in s."""
+    found = []
     for trajectory in tasks:
         masked = masked_values(trajectory)
         if masked.any():
-            longest = max(longest, float(Sides.of(trajectory).length[masked].max()))
-    return longest
+            found.append(float(Sides.of(trajectory).length[masked].max()))
+    return found
 
 
 def _errors(

@@ -96,20 +96,25 @@ class AgeBins:
         Args:
             tasks: as of `Baseline.fit`.
         """
-        return cls.of_lengths(typical_gap(tasks), longest_age(tasks))
+        ages = longest_ages(tasks)
+        usual = float(np.quantile(ages, 0.95)) if len(ages) else 0.0
+        return cls.of_lengths(typical_gap(tasks), usual, max(ages, default=0.0))
 
     @classmethod
-    def of_lengths(cls, gap: float, longest: float) -> AgeBins:
+    def of_lengths(cls, gap: float, usual: float, longest: float | None = None) -> AgeBins:
         """Bins up to a length.
 
         Args:
             gap: s, typical one.
-            longest: s.
+            usual: s; the last bin has at least the upper half of the lengths up to this.
+            longest: s, end of the last bin; by default `usual`.
         """
-        count = int(
-            np.clip(np.ceil(np.log2(max(longest / (1.5 * gap), 1.0)) - 0.3), 0, LONGEST_BIN)
-        )
+        longest = usual if longest is None else max(usual, longest)
+        ratio = max(usual / (1.5 * gap), 1.0)
+        count = int(np.clip(np.round(np.log2(ratio)), 0, LONGEST_BIN))
         edges = 1.5 * gap * 2.0 ** np.arange(count + 1)
+        if count:
+            edges = 1.5 * gap * ratio ** (np.arange(count + 1) / count)
         edges[-1] = max(edges[-1], longest)
         return cls(np.asarray(edges))
 
@@ -139,13 +144,23 @@ def typical_gap(dataset: Dataset) -> float:
     return float(np.median(every)) if len(every) else 1.0
 
 
-def longest_age(dataset: Dataset) -> float:
-    """Longest time from an observation of a channel to a later row where it is known, in s."""
-    longest = 0.0
+def longest_ages(dataset: Dataset) -> list[float]:
+    """Longest time from an observation of a channel to a later known value, per trajectory, in s.
+
+    Args:
+        dataset: trajectories without such a value are left out.
+    """
+    found = []
     for t in dataset:
         times = np.where(t.observed, t.times[:, None], -np.inf)
         before = np.vstack([np.full((1, t.channels), -np.inf), times[:-1]])
         age = t.times[:, None] - np.maximum.accumulate(before, axis=0)
         age = age[t.known & np.isfinite(age)]
-        longest = max(longest, float(age.max()) if len(age) else 0.0)
-    return longest
+        if len(age):
+            found.append(float(age.max()))
+    return found
+
+
+def longest_age(dataset: Dataset) -> float:
+    """Longest time from an observation of a channel to a later known value, in s."""
+    return max(longest_ages(dataset), default=0.0)

@@ -28,10 +28,12 @@ class LocalScale:
 
     Attributes:
         slope: the predictor.
+        middle: (bins,) mean logarithm of the times since observation in each bin.
         usual: (bins, channels) mean squared error of training, in squared units.
     """
 
     slope: DampedSlope
+    middle: Array
     usual: Array
 
     def fit(self, tasks: Dataset) -> LocalScale:
@@ -44,7 +46,7 @@ class LocalScale:
         self.slope.fit(tasks)
         bins = AgeBins(self.slope.edges)
         total = np.zeros((len(bins), tasks.channels))
-        count = np.zeros_like(total)
+        count, logs = np.zeros_like(total), np.zeros(len(bins))
         channel = np.arange(tasks.channels)
         for rows in padded(tasks):
             predicted = stepped(self.slope, rows)
@@ -53,10 +55,13 @@ class LocalScale:
             where = (bins.of_age(age)[counted], np.broadcast_to(channel, age.shape)[counted])
             np.add.at(total, where, (rows.values - predicted)[counted] ** 2)
             np.add.at(count, where, 1.0)
+            np.add.at(logs, where[0], np.log(np.maximum(age[counted], 1e-300)))
         mean = total / np.maximum(count, 1)
         # A bin without values takes that of the bin before it.
         for k in range(1, len(mean)):
             mean[k] = np.where(count[k] > 0, mean[k], mean[k - 1])
+        many = count.sum(axis=1)
+        self.middle = np.where(many > 0, logs / np.maximum(many, 1), np.log(bins.middle))
         floor = 1e-12 * self.slope.scale**2
         self.usual = np.maximum(mean, floor)
         return self
@@ -69,9 +74,7 @@ class LocalScale:
         """See `CausalBaseline`."""
         xp = namespace(values)
         predicted = self.slope.read(state, time)
-        at = AgeBins(self.slope.edges).of_age(History.age(state, time))
-        channel = np.arange(len(self.usual[0]))
-        usual = as_kind(self.usual, values)[at, channel if xp is np else xp.arange(len(channel))]
+        usual = self.usual_at(History.age(state, time))
         error = xp.clip((values - predicted) ** 2 / usual, 0.0, LARGEST)
         counted = mask & (state["count"] > 1)
         weight = xp.clip(1.0 / (state["seen"] + 2.0), FORGET, 1.0)
@@ -84,19 +87,44 @@ class LocalScale:
             "seen": state["seen"] + counted,
         }
 
+    def usual_at(self, age: Any) -> Any:
+        """Usual squared error at a time since observation, log-linear between the bins' middles.
+
+        Args:
+            age: (..., channels) s; infinite before the first observation.
+
+        Returns:
+            (..., channels) in squared units.
+        """
+        xp = namespace(age)
+        bins = AgeBins(self.slope.edges)
+        logs = as_kind(np.log(self.usual), age)
+        channel = np.arange(len(self.usual[0])) if xp is np else xp.arange(len(self.usual[0]))
+        if len(bins) == 1:
+            return xp.exp(logs[0]) + 0.0 * xp.where(xp.isinf(age), 0.0, age)
+        middle = as_kind(self.middle, age)
+        last = float(self.middle[-1]) + 0.7
+        place = xp.clip(xp.log(xp.clip(age, 1e-300, 1e300)), float(self.middle[0]), last)
+        at = 0.0 * place
+        for edge in self.middle[1:-1]:
+            at = at + (place > float(edge))
+        at = at.astype(np.int64) if xp is np else at.long()
+        part = (place - middle[at]) / (middle[at + 1] - middle[at])
+        return xp.exp((1 - part) * logs[at, channel] + part * logs[at + 1, channel])
+
     def read(self, state: State, time: Any) -> Any:
         """(batch, channels) squared size of the present motion, 1 where it is as usual."""
         return state["square"]
 
     def arrays(self) -> dict[str, Array]:
         """See `Baseline`."""
-        return {**self.slope.arrays(), "usual": self.usual}
+        return {**self.slope.arrays(), "usual": self.usual, "middle": self.middle}
 
     def restore(self, arrays: Mapping[str, Array]) -> LocalScale:
         """See `Baseline`."""
-        self.usual = np.asarray(arrays["usual"])
+        self.usual, self.middle = np.asarray(arrays["usual"]), np.asarray(arrays["middle"])
         self.slope = DampedSlope()
-        self.slope.restore({k: v for k, v in arrays.items() if k != "usual"})
+        self.slope.restore({k: v for k, v in arrays.items() if k not in ("usual", "middle")})
         return self
 
 

@@ -122,21 +122,28 @@ class Keys:
         """(keys,) s, upper end of the bin; infinite for the last kind."""
         return np.append(np.repeat(self.bins.edges, LEVELS), np.inf)
 
-    def units(self) -> Array:
-        """(keys, channels) usual size of an error, in original units."""
-        usual = np.repeat(self.local.usual, LEVELS, axis=0)
-        return np.sqrt(np.vstack([usual, self.local.slope.scale**2]))
+    def unit(self, kind: Array) -> Array:
+        """(...) typical size of an error, in original units.
+
+        The usual error at that time since observation, times the fourth root of the local scale.
+
+        Args:
+            kind: (..., channels, 4) of `read`.
+        """
+        usual = np.sqrt(self.local.usual_at(kind[..., 2]))
+        unit = np.where(np.isinf(kind[..., 2]), self.local.slope.scale, usual)
+        return np.asarray(unit * kind[..., 1] ** 0.25)
 
     def cells(self, tasks: Dataset) -> Cells:
         """The known values of tasks."""
         parts: list[tuple[NDArray[Any], ...]] = []
-        units, first = self.units(), 0
+        first = 0
         for rows in padded(tasks):
             read = stepped(self, rows)
             task, row, channel = np.nonzero(rows.known)
             key, square, _, last = np.moveaxis(read[task, row, channel], -1, 0)
             key = key.astype(np.int64)
-            unit = units[key, channel] * np.sqrt(np.sqrt(square))
+            unit = self.unit(read)[task, row, channel]
             truth = rows.values[task, row, channel]
             parts.append((task + first, row, channel, key, square, unit, last, truth))
             first += len(rows.lengths)

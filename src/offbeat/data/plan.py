@@ -30,7 +30,7 @@ _FEWEST_ROWS = 24
 _FEWEST_EPISODES = 10  # for a split by trajectory
 _LONGEST_HORIZON_S = 1.0
 _FEWEST_STEPS, _SHORT_STEPS = 5, 10  # typical gaps in a horizon, and in the longest of a slow log
-_WINDOW_ROWS, _MOST_ROWS = 64, 4000
+_WINDOW_ROWS, _MOST_ROWS = 64, 600
 _SLOW_VALUES = 5  # of the slowest sensor in a window
 _SILENCE = 3.0  # median steps of a sensor
 _MOST_BLOCKS, _BLOCK_ROWS = 5, 20
@@ -80,7 +80,7 @@ class Plan:
     @property
     def whole(self) -> SplitConfig:
         """The split without windows and masks, for tasks to be drawn from its parts."""
-        return _whole(self.split)
+        return without_windows(self.split)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form."""
@@ -151,7 +151,7 @@ def plan(
             + ("; ..." if len(sensors) > 4 else "")
         )
     ladder = [float(f"{f * horizon:.3g}") for f in (0.1, 0.2, 0.5, 1.0)]
-    parts = apply_split(clean, whole(split))
+    parts = apply_split(clean, without_windows(split))
     if split is found and split.mask == "dropout":
         split = replace(split, sensors=sensors)
     return Plan(
@@ -467,7 +467,7 @@ def _most_alike(dataset: Dataset, split: SplitConfig) -> SplitConfig:
     for k in range(tries):
         tried = replace(split, seed=(split.seed + 1000 * k) % 2**32)
         try:
-            unlike = unlikeness(*apply_split(dataset, whole(tried)))
+            unlike = unlikeness(*apply_split(dataset, without_windows(tried)))
         except InputError:  # a part is empty
             continue
         if least is None or unlike < least:
@@ -477,7 +477,7 @@ def _most_alike(dataset: Dataset, split: SplitConfig) -> SplitConfig:
     return best
 
 
-def whole(split: SplitConfig) -> SplitConfig:
+def without_windows(split: SplitConfig) -> SplitConfig:
     """The split without windows and masks."""
     return replace(
         split,
@@ -495,7 +495,7 @@ def whole(split: SplitConfig) -> SplitConfig:
 
 def _never_trained(dataset: Dataset, split: SplitConfig) -> tuple[str, ...]:
     """States that have a value, but none in the training part."""
-    train, _, _ = apply_split(dataset, whole(split))
+    train, _, _ = apply_split(dataset, without_windows(split))
     seen = np.any([t.observed.any(axis=0) for t in train], axis=0)
     return tuple(
         name

@@ -42,7 +42,7 @@ def draw_tasks(
     - `burst` hides all sensors together, for 30 % of the time, in runs of log-uniform length.
     - `scattered` hides a uniform fraction of the rows, 10 to 70 %, at random.
 
-    Lengths are between 1.5 typical gaps and the horizon. Hidden values stay known.
+    Lengths are between 1.5 typical gaps and 1.1 horizons. Hidden values stay known.
 
     Args:
         dataset: to draw from, trajectories by their number of rows.
@@ -149,8 +149,8 @@ def _runs(
 
 
 def _length(config: TaskConfig, random: np.random.Generator) -> float:
-    """s, log-uniform from 1.5 typical gaps to the horizon."""
-    low, high = 1.5 * config.gap_s, max(config.horizon_s, 2 * config.gap_s)
+    """s, log-uniform from 1.5 typical gaps to 1.1 horizons, so that the horizon is inside."""
+    low, high = 1.5 * config.gap_s, max(1.1 * config.horizon_s, 2 * config.gap_s)
     return float(np.exp(random.uniform(np.log(low), np.log(high))))
 
 
