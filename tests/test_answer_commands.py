@@ -57,24 +57,26 @@ def table(path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_two_sided_run_holds_both_models_and_says_who_wins(run):
+def test_a_run_holds_a_blend_of_both_models_and_says_who_wins(run):
     inside = {path.name for path in run.iterdir()}
-    assert {"model", "backward", "two_sided.json", "reader.json", "split.json"} <= inside
+    assert {"model", "backward", "blend.json", "reader.json", "split.json"} <= inside
     results = json.loads((run / "results.json").read_text())
-    filled = results["imputation"]["rmse_in_units"]
-    assert set(filled) == {"causal", "two_sided", "last_value", "linear", "pchip"}
-    assert set(filled["linear"]) == set(NAMES)
-    assert "win" in results["imputation"]["verdict"]
-    assert "one step ahead" in results["verdict"]
+    tasks = {task["task"]: task for task in results["tasks"]}
+    assert list(tasks)[:3] == ["one step ahead", "imputation, causal", "imputation, two_sided"]
+    filled = tasks["imputation, two_sided"]
+    assert {"blend", "linear", "pchip"} <= set(filled["rmse_in_units"])
+    assert set(filled["rmse_in_units"]["linear"]) == set(NAMES)
+    assert "win" in filled["verdict"]
+    assert set(filled["coverage"]) == {"0.5", "0.8", "0.95"}
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert config["two_sided"] is True
     assert config["reader"] == {"time_column": "stamp", "time_unit": "ms", "outliers": "mask"}
 
 
-def test_the_saved_config_trains_the_same_pair_again(run, log, tmp_path):
+def test_the_saved_config_trains_the_same_blend_again(run, log, tmp_path):
     out = tmp_path / "again"
     assert main(["train", f"--config={run / 'config.yaml'}", str(log), str(out)]) == 0
-    for name in ("results.json", "two_sided.json"):
+    for name in ("results.json", "blend.json"):
         assert json.loads((out / name).read_text()) == json.loads((run / name).read_text())
 
 
@@ -83,8 +85,9 @@ def test_impute_keeps_what_was_measured_and_fills_the_rest(run, log, tmp_path, m
     out = tmp_path / "filled.csv"
     assert main(["impute", str(run), str(log), str(out), f"--mode={mode}"]) == 0
     lines, before = table(out), table(log)
-    assert list(lines[0]) == [
-        "trajectory", "time", "clock_ms", *NAMES, *(f"{n}|observed" for n in NAMES)
+    assert [name for name in lines[0] if not name.endswith("|beyond")] == [
+        "trajectory", "time", "clock_ms", *NAMES,
+        *(f"{n}|{what}" for what in ("observed", "low", "high") for n in NAMES),
     ]  # fmt: skip
     assert [int(line["clock_ms"]) for line in lines] == [int(line["stamp"]) for line in before]
     for line, was in zip(lines, before, strict=True):
@@ -92,8 +95,9 @@ def test_impute_keeps_what_was_measured_and_fills_the_rest(run, log, tmp_path, m
             assert (line[f"{name}|observed"] == "true") == (was[name] != "")
             assert np.isfinite(float(line[name]))
             assert not was[name] or float(line[name]) == float(was[name])
+            assert float(line[f"{name}|low"]) <= float(line[name]) <= float(line[f"{name}|high"])
     data = ob.read(log, time_column="stamp", time_unit="ms")
-    expected = ob.impute(ob.load_two_sided(run), data, mode=mode)[0]
+    expected = ob.impute(ob.load_run(run), data, mode=mode)[0]
     got = [[float(line[name]) for name in NAMES] for line in lines]
     assert np.array_equal(got, expected.values)
 
@@ -141,7 +145,7 @@ def test_extrapolate_answers_after_the_last_row_on_the_clock_of_the_log(run, log
     assert [int(line["clock_ms"]) for line in lines] == [1000 + 3990 + 50, 1000 + 3990 + 200]
     assert {line[f"{name}|observed"] for line in lines for name in NAMES} == {"false"}
     data = ob.read(log, time_column="stamp", time_unit="ms")
-    expected = ob.forecast(ob.load_model(run), data, [0.05, 0.2])[0].values
+    expected = ob.forecast(ob.load_run(run), data, [0.05, 0.2])[0].values
     assert np.array_equal([[float(line[name]) for name in NAMES] for line in lines], expected)
 
 
@@ -152,18 +156,20 @@ def test_evaluate_scores_fills_and_forecasts_of_the_test_part(run, log, capsys):
     said = json.loads(capsys.readouterr().out)
     results = json.loads((run / "results.json").read_text())
     assert said["part"] == "test"
-    assert said["imputation"] == results["imputation"]
-    assert [part["horizon_s"] for part in said["extrapolation"]] == [0.02, 0.1]
-    for part in said["extrapolation"]:
-        assert set(part["rmse_in_units"]) == {
-            "anchored_ode_gru_d", "last_value", "constant_velocity"
-        }  # fmt: skip
+    tasks = {task["task"]: task for task in said["tasks"]}
+    before = {task["task"]: task for task in results["tasks"]}
+    for name in ("imputation, causal", "imputation, two_sided"):
+        assert tasks[name] == before[name]
+    assert [name for name in tasks if "forecast" in name] == ["forecast, 0.02 s", "forecast, 0.1 s"]
+    baselines = set(ob.load_run(run).stack.members)
+    for name in ("forecast, 0.02 s", "forecast, 0.1 s"):
+        predictors = {"blend", "anchored_ode_gru_d alone", *baselines}
+        assert set(tasks[name]["rmse_in_units"]) == predictors
     assert main(arguments) == 0
     text = capsys.readouterr().out
-    assert "imputation: " in text
-    assert "forecast, 0.1 s: " in text
-    for verdict in (said["imputation"]["verdict"], said["verdict"]):
-        assert verdict in text
+    assert "gamma: channel" in text
+    for task in said["tasks"]:
+        assert task["verdict"] in text
 
 
 def test_other_data_is_masked_in_any_way_and_scored_as_a_whole(run, log, tmp_path, capsys):
@@ -177,7 +183,7 @@ def test_other_data_is_masked_in_any_way_and_scored_as_a_whole(run, log, tmp_pat
     data = ob.read(other, time_column="stamp", time_unit="ms")
     masked = ob.mask_out(data, 0.6, mask="values")[0]
     expected = (data[0].observed & ~masked.observed).sum(axis=0).tolist()
-    assert list(said["imputation"]["counts"].values()) == expected
+    assert list(said["tasks"][1]["counts"].values()) == expected
 
 
 def test_figures_are_written_on_request(run, log, tmp_path):
@@ -295,15 +301,7 @@ def test_the_lasa_example_runs_from_demonstrations_to_scores(tmp_path, capsys):
     arguments = ["train", f"--config={root / 'lasa.yaml'}", *small, str(data), str(out)]
     assert main(arguments) == 0
     results = json.loads((out / "results.json").read_text())
-    assert results["imputation"]["units"] == {"x": "mm", "y": "mm", "vx": "mm/s", "vy": "mm/s"}
+    assert results["tasks"][1]["units"] == {"x": "mm", "y": "mm", "vx": "mm/s", "vy": "mm/s"}
     capsys.readouterr()
     assert main(["evaluate", str(out), str(data), "--horizons=0.1"]) == 0
     assert "forecast, 0.1 s: " in capsys.readouterr().out
-
-
-def test_the_example_for_one_long_log_runs(log, tmp_path):
-    config = Path(__file__).parents[1] / "examples" / "log.yaml"
-    small = ["--training.epochs=1", "--split.window_s=0.4", "--split.burst_s=0.05", *MODEL[:2]]
-    out = tmp_path / "run"
-    assert main(["train", f"--config={config}", *small, *READER, str(log), str(out)]) == 0
-    assert ob.load_two_sided(out).forward.names == NAMES

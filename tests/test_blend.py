@@ -134,7 +134,8 @@ def test_models_that_continue_straight_are_joined_to_the_cubic_hermite_interpola
 @pytest.fixture(scope="module")
 def blend():
     config = TaskConfig(horizon_s=0.3, gap_s=0.01)
-    return fit_blend(waves(0), waves(1, 4), tasks=config)
+    members = ["last_value", "mean", "constant_velocity", "damped_slope", "kalman_short"]
+    return fit_blend(waves(0), waves(1, 4), tasks=config, causal=members, two_sided=["pchip"])
 
 
 def counted(t: ob.Trajectory) -> np.ndarray:
@@ -228,7 +229,8 @@ def with_models(blend):
     train, validation = waves(0), waves(1, 4)
     model = ob.make_model("gru", train, seed=0)
     backward = ob.make_model("gru", train, seed=1)
-    return fit_blend(train, validation, model, backward, tasks=blend.tasks)
+    members = {"causal": list(blend.stack.members), "two_sided": ["linear", "pchip"]}
+    return fit_blend(train, validation, model, backward, tasks=blend.tasks, **members)
 
 
 def test_a_model_with_nothing_to_say_changes_little(with_models):

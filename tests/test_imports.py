@@ -32,6 +32,7 @@ STAGES = (
     "training",
     "ladder",
     "answers",
+    "learning",
     "evaluation",
     "stream",
     "export",

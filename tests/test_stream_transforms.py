@@ -251,15 +251,17 @@ def test_scores_of_a_wrapped_log_are_those_of_the_unwrapped_one() -> None:
             np.testing.assert_allclose(rmse, other.rmse[predictor], rtol=1e-9)
 
 
-def test_a_pair_fills_a_wrapped_log_as_it_fills_the_unwrapped_one() -> None:
+def test_a_blend_fills_a_wrapped_log_as_it_fills_the_unwrapped_one() -> None:
     clean = turning()
     train = ob.Dataset((clean[0], turning(seed=3)[0]), clean.meta)
     model = model_of(train)
     config = ob.TrainConfig(epochs=1, batch_size=2, optimizer="adam")
-    pair, _, _ = ob.fit_two_sided(model, train, train, config, progress=False)
-    assert pair.backward.transforms == TRANSFORMS
+    backward, _ = ob.fit_backward(model, train, train, config, progress=False)
+    assert backward.transforms == TRANSFORMS
+    members = {"causal": ["last_value"], "two_sided": ["linear"]}
+    blend = ob.fit_blend(train, train, model, backward, **members)
     sent = as_sent(clean)
-    wrapped, plain = (ob.impute(pair, data)[0].values for data in (sent, clean))
+    wrapped, plain = (ob.impute(blend, data)[0].values for data in (sent, clean))
     masked = ~sent[0].observed
     same_pose(np.where(masked, wrapped, 0), np.where(masked, plain, 0), atol=1e-9)
     assert np.abs(wrapped[:, 0]).max() <= math.pi

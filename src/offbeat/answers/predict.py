@@ -162,6 +162,19 @@ def times_of_each(times: Times, count: int) -> list[NDArray[np.float64]]:
     return [increasing_seconds(at, f"times of trajectory {i}") for i, at in enumerate(each)]
 
 
+def predicts_any_time(model: BaseModel | Blend) -> bool:
+    """Whether a model predicts at other times than those of its rows.
+
+    Args:
+        model: trained or not.
+    """
+    try:
+        check_any_time(model)
+    except InputError:
+        return False
+    return True
+
+
 def check_any_time(model: BaseModel | Blend) -> None:
     """Checks that a row in which nothing is observed changes no other prediction.
 

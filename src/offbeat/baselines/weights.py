@@ -30,6 +30,9 @@ STILL = 1.0
 CAUTION = 2.0
 """Tasks in which a model has nothing to say that count beside the others."""
 
+FARTHEST = 1e8
+"""Largest difference of a model from the base that counts, in units of an error."""
+
 OUTLIER = 20.0
 """Errors of all predictors beyond this multiple of the usual one count less."""
 
@@ -212,7 +215,7 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
         (keys, channels); 0 where there is no value.
     """
     weight, effective = task_weights(errors, channels)
-    moved, left = model - base, errors.truth - base
+    moved, left = np.clip(model - base, -FARTHEST, FARTHEST), errors.truth - base
     weight = weight * _robust(left[:, None])
     place = errors.key * channels + errors.channel
     shape = (errors.keys, channels)
@@ -223,7 +226,7 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
 
     cross, square, least = summed(moved * left), summed(moved**2), summed(left**2)
     many = np.maximum(effective, 1e-12)
-    relative = many / np.maximum(least, 1e-300)
+    relative = many / np.maximum(least, 1e-9 * many)
     pooled_square = (square * relative).sum(axis=1) + 1e-12
     pooled = np.clip((cross * relative).sum(axis=1) / pooled_square, 0.0, 1.0)[:, None]
     typical = square / many

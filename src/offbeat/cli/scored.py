@@ -14,6 +14,7 @@ from offbeat import baselines, tables
 from offbeat.answers.blend import TASKS, Blend, number_of_tasks
 from offbeat.answers.forecast import forecast
 from offbeat.answers.impute import impute
+from offbeat.answers.predict import predicts_any_time
 from offbeat.answers.scoring import (
     ChannelScores,
     score_forecast,
@@ -89,7 +90,7 @@ def _scored_blend(
     if after is None:
         longest = max(float(t.times[-1] - t.times[0]) for t in dataset)
         after = [h for h in default_horizons(blend) if h < longest]
-    if len(after):
+    if len(after) and (horizons is not None or predicts_any_time(blend)):
         tasks += score_forecast(blend, dataset, after)
     result: dict[str, Any] = {} if evaluation is None else evaluation.to_dict()
     result["tasks"] = [scores.to_dict() for scores in tasks]
