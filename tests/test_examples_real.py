@@ -10,6 +10,7 @@ import offbeat as ob
 from examples import arm_log
 from examples.real_logs import logs, predictors, report, results, scores, tasks
 from examples.real_logs.__main__ import main
+from offbeat.answers.scoring import score_one_step
 from offbeat.baselines import fit_baseline
 
 HORIZONS = ["forecast 0.1 s", "forecast 0.2 s", "forecast 0.5 s", "forecast 1 s"]
@@ -82,34 +83,34 @@ def test_baselines_have_the_published_errors(name, log_of):
 @pytest.fixture(scope="module")
 def quick_lasa():
     log = logs.lasa(True)
-    pair = predictors.offbeat_pair(log, 0, True)
-    return log, pair["offbeat"].model, pair["offbeat_two_sided"].pair
+    return log, predictors.offbeat(log, 0, True)["offbeat"].blend
 
 
 def test_scores_are_those_of_the_library(quick_lasa):
-    log, model, pair = quick_lasa
+    log, blend = quick_lasa
     test = log.tests["test"]
     asked = {task.name: task for task in log.asked["test"]}
-    causal, both = predictors.Causal(model), predictors.BothSides(pair)
+    causal = predictors.Blended(blend, causal=True)
+    both = predictors.Blended(blend, causal=False)
 
     def same(task, predictor, expected, name):
         found = scores.score(asked[task], predictor, log.scale)
         # The library computes in float32 where a model is asked in batches.
-        assert found["rmse_scaled"] == pytest.approx(expected.overall[name], rel=1e-5)
         assert found["rmse"] == pytest.approx(expected.rmse[name], rel=1e-5)
         assert scores.counts(asked[task]) == list(expected.counts)
 
     last = fit_baseline("last_value", log.training_windows)
-    one = ob.evaluate(model, test).in_units()
-    same("one step", causal, one, model.name)
+    one = score_one_step(blend, test)
+    same("one step", causal, one, "blend")
     same("one step", last, one, "last_value")
-    filled = ob.score_imputation(pair, asked["fill 0.5 s"].dataset).scores
-    same("fill 0.5 s", causal, filled, "causal")
-    same("fill 0.5 s", both, filled, "two_sided")
+    for predictor, mode in ((causal, "causal"), (both, "two_sided")):
+        masked = asked["fill 0.5 s"].dataset
+        filled = ob.score_imputation(blend, masked, mode=mode).scores
+        same("fill 0.5 s", predictor, filled, "blend")
     for horizon, ahead in zip(
-        HORIZONS, ob.score_forecast(model, test, logs.HORIZONS_S, targets=12), strict=True
+        HORIZONS, ob.score_forecast(blend, test, logs.HORIZONS_S, targets=12), strict=True
     ):
-        same(horizon, causal, ahead, model.name)
+        same(horizon, causal, ahead, "blend")
         same(horizon, last, ahead, "last_value")
 
 
@@ -290,8 +291,10 @@ def test_the_document_shows_the_best_baselines_and_all_of_offbeat(ran):
     assert [n for n in names if n.startswith("offbeat")] == [
         "offbeat_blend",
         "offbeat",
+        "offbeat_model",
         "offbeat_blend_two_sided",
         "offbeat_two_sided",
+        "offbeat_models_two_sided",
     ]
     best, _ = (n for n in names if not n.startswith("offbeat"))
     means = {

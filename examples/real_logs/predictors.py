@@ -7,26 +7,23 @@ its intervals are scored. To add one, write a function that makes it and put it 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 import offbeat as ob
 from offbeat.answers.answer import Answer
-from offbeat.answers.blend import Blend, fit_blend
+from offbeat.answers.blend import Blend, fit_blend, model_fills
 from offbeat.baselines import BASELINES, fit_baseline
+from offbeat.learning import train_blend
 
 from .logs import Log
 
 Array = NDArray[np.float64]
 MODEL = "anchored_ode_gru_d"
-RATES = (0.001, 0.004)
-"""Learning rates that are tried; the one of the lower validation MSE is kept."""
 
 UNFITTED = ("last_value", "mean", "constant_velocity", "linear", "pchip")
 """Baselines that have nothing but the training mean; they are run once, not once per seed."""
@@ -57,7 +54,7 @@ class Causal:
         model: trained.
     """
 
-    model: ob.Model
+    model: ob.BaseModel
     causal = True
 
     def predict(self, dataset: ob.Dataset) -> list[Array]:
@@ -67,18 +64,20 @@ class Causal:
 
 @dataclass(frozen=True)
 class BothSides:
-    """A forward and a backward model, asked to fill what is not observed.
+    """A forward and a backward model joined, asked to fill what is not observed.
 
     Attributes:
-        pair: trained.
+        blend: with both models.
     """
 
-    pair: ob.TwoSided
+    blend: Blend
     causal = False
 
     def predict(self, dataset: ob.Dataset) -> list[Array]:
         """See `Predictor`."""
-        return [t.values for t in ob.impute(self.pair, dataset)]
+        fills = model_fills(self.blend.forward, self.blend.backward, dataset)
+        assert fills is not None
+        return fills
 
 
 class Blended:
@@ -146,48 +145,27 @@ def baseline(name: str) -> Entry:
     return Entry(make, (name,), once=name in UNFITTED)
 
 
-def offbeat_pair(log: Log, seed: int, quick: bool) -> Mapping[str, Predictor]:
-    """A forward and a backward model; learning rate and epoch are chosen on the validation part.
+def offbeat(log: Log, seed: int, quick: bool) -> Mapping[str, Predictor]:
+    """The blend of baselines and models, as `offbeat.learn` trains it, and its models alone.
 
     Args:
         log: to train on.
-        seed: of the initial weights and of the order of the windows.
-        quick: two epochs, for tests.
+        seed: of the initial weights and of the tasks.
+        quick: two epochs of one model, for tests.
     """
-    train, validation = log.training_windows, log.validation_windows
-    with tempfile.TemporaryDirectory() as kept:
-
-        def config(rate: float) -> ob.TrainConfig:
-            return ob.train_config(
-                MODEL,
-                epochs=2 if quick else log.epochs,
-                batch_size=log.batch_size,
-                learning_rate=rate,
-                keep="best",
-                seed=seed,
-            )
-
-        def fresh() -> ob.Model:
-            return ob.make_model(MODEL, train, field_units=(64, 64), seed=seed)
-
-        lowest: dict[float, float] = {}
-        for rate in RATES:
-            fitted = ob.fit(
-                fresh(),
-                train,
-                validation,
-                config(rate),
-                out=Path(kept) / f"{rate:g}",
-                progress=False,
-            )
-            lowest[rate] = min(record.validation_mse for record in fitted.history)
-        rate = min(lowest, key=lambda each: lowest[each])
-        # The forward training in that folder is finished; only the backward one runs.
-        folder = Path(kept) / f"{rate:g}"
-        pair, _, _ = ob.fit_two_sided(
-            fresh(), train, validation, config(rate), out=folder, seed=seed, progress=False
-        )
-    return {"offbeat": Causal(pair.forward), "offbeat_two_sided": BothSides(pair)}
+    options: dict[str, Any] = {"as_it_is": bool(log.masked), "seed": seed, "progress": False}
+    if quick:
+        options |= {"model": MODEL, "training": ob.TrainConfig(epochs=2, seed=seed)}
+        if not log.masked:
+            options["training"] = ob.TrainConfig(epochs=2, seed=seed, tasks_per_epoch=32)
+    blend, _, _ = train_blend(log.train, log.validation, log.task_config, **options)
+    assert blend.forward is not None
+    return {
+        "offbeat": Blended(blend, causal=True),
+        "offbeat_two_sided": Blended(blend, causal=False),
+        "offbeat_model": Causal(blend.forward),
+        "offbeat_models_two_sided": BothSides(blend),
+    }
 
 
 def blend_of_baselines(log: Log, seed: int, quick: bool) -> Mapping[str, Predictor]:
@@ -213,6 +191,9 @@ def blend_of_baselines(log: Log, seed: int, quick: bool) -> Mapping[str, Predict
 
 PREDICTORS: dict[str, Entry] = {name: baseline(name) for name in BASELINES} | {
     "offbeat_blend": Entry(blend_of_baselines, ("offbeat_blend", "offbeat_blend_two_sided")),
-    "offbeat": Entry(offbeat_pair, ("offbeat", "offbeat_two_sided")),
+    "offbeat": Entry(
+        offbeat,
+        ("offbeat", "offbeat_two_sided", "offbeat_model", "offbeat_models_two_sided"),
+    ),
 }
 """Predictors by name, in the order of the tables."""

@@ -107,7 +107,6 @@ def learn(
     """
     dataset = Dataset.of(dataset)
     check_seed(seed)
-    folder = Path(out) if out is not None else None
     if chosen is None and not as_it_is:
         chosen = plan(dataset, horizon_s=horizon_s, split=split, seed=seed)
         dataset = prepare(dataset, chosen)
@@ -126,13 +125,69 @@ def learn(
         )
         train, validation, _ = apply_split(dataset, chosen.whole)
         test = apply_split(dataset, split)[2]
-    kind: Any = scaler or ("standardise" if as_it_is else "robust")
     tasks = _tasks(chosen, train, horizon_s)
+    blend, fitted, said = train_blend(
+        train,
+        validation,
+        tasks,
+        out=out,
+        model=model,
+        training=training,
+        as_it_is=as_it_is,
+        two_sided=two_sided,
+        scaler=scaler,
+        budget_s=budget_s,
+        seed=seed,
+        device=device,
+        progress=progress,
+    )
+    notes = (*(() if chosen is None else chosen.notes), *said)
+    return Learned(blend, train, validation, test, split, fitted, chosen, notes)
+
+
+def train_blend(
+    train: Dataset,
+    validation: Dataset,
+    tasks: TaskConfig,
+    *,
+    out: str | Path | None = None,
+    model: str | ModelConfig | None = None,
+    training: TrainConfig | None = None,
+    as_it_is: bool = False,
+    two_sided: bool = True,
+    scaler: ScalerKind | Scaler | None = None,
+    budget_s: float = BUDGET_S,
+    seed: int = 0,
+    device: str | None = None,
+    progress: bool = True,
+) -> tuple[Blend, FitResult, tuple[str, ...]]:
+    """Trains models on parts of a data set, and blends them with baselines.
+
+    Args:
+        train: training part.
+        validation: validation part.
+        tasks: what will be asked.
+        out: as of `learn`, as are all others.
+        model: to train, or None for the best of a few.
+        training: options that differ from the recipe.
+        as_it_is: train on the trajectories and masks as they are.
+        two_sided: train a backward model.
+        scaler: of the models.
+        budget_s: s, for the trainings.
+        seed: of weights and tasks.
+        device: to train on.
+        progress: show progress bars.
+
+    Returns:
+        The blend, the training of the forward model, and sentences on the choice of the model.
+    """
+    folder = Path(out) if out is not None else None
+    kind: Any = scaler or ("standardise" if as_it_is else "robust")
     common: dict[str, Any] = {"device": device, "progress": progress}
     config = training or TrainConfig(seed=seed)
     if not as_it_is:
         config = replace(config, tasks=tasks)
-    notes = [] if chosen is None else [*chosen.notes]
+    said: tuple[str, ...] = ()
     forward: BaseModel
     if model is None and not as_it_is:
         result = fit_ladder(
@@ -147,8 +202,10 @@ def learn(
             **common,
         )
         forward, fitted = result.model, result.fit
-        config = replace(config, epochs=len(fitted.history))
-        notes.append(_said(result))
+        # The backward model takes the rest of the time.
+        rate = result.trials[result.chosen].candidate.learning_rate
+        config = replace(config, epochs=max(len(fitted.history) // 2, 4), learning_rate=rate)
+        said = (_said(result),)
     else:
         forward = make_model(model or "anchored_ode_gru_d", train, scaler=kind, seed=seed)
         fitted = fit(forward, train, validation, config, out=folder, **common)
@@ -175,7 +232,7 @@ def learn(
     )
     if folder is not None:
         save_blend(blend, folder)
-    return Learned(blend, train, validation, test, split, fitted, chosen, tuple(notes))
+    return blend, fitted, said
 
 
 def _said(result: LadderResult) -> str:
