@@ -89,9 +89,10 @@ def test_a_control_differs_from_the_row_of_the_thesis_in_self_feeding_alone(labe
     }
 
 
-def test_the_anchored_model_is_the_zoo_s_with_its_own_training():
+def test_the_anchored_model_is_the_zoo_s_with_steps_per_row_and_its_own_training():
     label = "anchored_ode_gru_d"
-    assert resolve(FULL.model_config(label)) == resolve(ob.ModelConfig(name=label))
+    config = ob.ModelConfig(name=label, nodes="rows", bounded=False)
+    assert resolve(FULL.model_config(label)) == resolve(config)
     run = next(run for run in FULL.runs() if run.model == label)
     expected = ob.train_config(label, epochs=75, seed=run.seed_draw, keep="last")
     assert FULL.train_config(run) == expected
