@@ -9,7 +9,8 @@ import torch
 from task_helpers import SMALL, TASKS, TRAIN, VALIDATION, same, weights
 
 import offbeat as ob
-from offbeat.answers.impute import fit_backward
+from offbeat.answers.backward import fit_backward
+from offbeat.answers.both_sides import reversed_in_time
 from offbeat.baselines import AgeBins, LastValue, fit_baseline
 from offbeat.baselines.errors import ErrorTable, cells
 from offbeat.baselines.stack import fit_stack
@@ -276,25 +277,16 @@ def test_the_log_has_the_score_and_the_best_epoch_is_the_one_that_is_kept(tmp_pa
     assert "validation_score" in (tmp_path / "log.csv").read_text().splitlines()[0]
 
 
-def test_a_pair_is_trained_on_tasks_and_the_backward_model_on_fills_from_both_sides(tmp_path):
+def test_a_backward_model_is_trained_on_tasks_of_fills_from_both_sides():
     model = ob.make_model("anchored_ode_gru_d", TRAIN, **SMALL)
     config = ob.TrainConfig(tasks=TASKS, epochs=2, tasks_per_epoch=24)
-    pair, ahead, back = ob.fit_two_sided(
-        model, TRAIN, VALIDATION, config, out=tmp_path, progress=False
-    )
-    assert ahead.recipe.tasks == TASKS
-    assert back.recipe.tasks == replace(TASKS, shares=TWO_SIDED)
-    task = draw_tasks(VALIDATION, TASKS, 5, shares=TWO_SIDED, seed=2)
-    filled = ob.impute(pair, task)
-    assert all(np.isfinite(t.values).all() for t in filled)
-    alone, _ = fit_backward(
-        ob.make_model("anchored_ode_gru_d", TRAIN, **SMALL),
-        TRAIN,
-        VALIDATION,
-        config,
-        progress=False,
-    )
-    assert same(weights(alone), weights(pair.backward))
+    back, result = fit_backward(model, TRAIN, VALIDATION, config, progress=False)
+    assert result.recipe.tasks == replace(TASKS, shares=TWO_SIDED)
+    alone = ob.make_model(model.config, reversed_in_time(TRAIN), scaler=model.scaler)
+    given = replace(config, tasks=replace(TASKS, shares=TWO_SIDED))
+    parts = reversed_in_time(TRAIN), reversed_in_time(VALIDATION)
+    ob.fit(alone, *parts, given, progress=False)
+    assert same(weights(alone), weights(back))
 
 
 # --- corrections ------------------------------------------------------------------------------

@@ -209,6 +209,8 @@ def train_blend(
     else:
         forward = make_model(model or "anchored_ode_gru_d", train, scaler=kind, seed=seed)
         fitted = fit(forward, train, validation, config, out=folder, **common)
+    if fitted.diverged:
+        said = (*said, fitted.diverged)
     backward = None
     if two_sided:
         backward, _ = fit_backward(

@@ -67,7 +67,6 @@ def train_command(
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
     from offbeat.learning import learn
-    from offbeat.models.model import Model
     from offbeat.models.zoo import MODELS
 
     if scaler is not None:
@@ -116,7 +115,7 @@ def train_command(
     resolved = {
         "data": str(data),
         "out": str(out),
-        "model": plain(asdict(made.config)) if isinstance(made, Model) else {"name": made.name},
+        "model": _resolved(made, model),
         "training": plain(asdict(learned.fit.recipe)),
         "split": plain(asdict(learned.split)),
         "scaler": made.scaler.kind,
@@ -137,3 +136,14 @@ def train_command(
     write_json(out / "results.json", result)
     heading = f"{out}: {learned.fit.steps} steps; scores of the test part"
     say(result, f"{heading}\n{text}", json)
+
+
+def _resolved(made: Any, given: ModelConfig) -> dict[str, Any]:
+    """The options of the model for config.yaml: with them, the same command gives the same model.
+
+    A model that was chosen among a few is chosen again.
+    """
+    config = getattr(made, "config", None)
+    if isinstance(config, ModelConfig):
+        return plain(asdict(config))
+    return plain({k: v for k, v in asdict(given).items() if v is not None})
