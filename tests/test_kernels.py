@@ -157,6 +157,21 @@ def test_the_compiled_backend_equals_the_reference_at_full_size(
 
 @needs_cpu
 @pytest.mark.parametrize("keep", [True, False], ids=["with a tape", "without a tape"])
+def test_one_trajectory_may_lie_at_a_node_and_another_between_two(keep: bool) -> None:
+    """Together they take one step more than either of them."""
+    case = problem(
+        seed=5, batch=2, rows=1, channels=2, hidden=3, cell="gru", flow="euler, nodes", units=(4,)
+    )
+    first = torch.zeros(2, 1)
+    rows = replace(
+        case.rows, first_node=first, node=first + torch.tensor([[3.0], [0.0]]),
+        gap=torch.tensor([[0.0], [0.2]]),
+    )  # fmt: skip
+    agree(case._replace(rows=rows), keep=keep)
+
+
+@needs_cpu
+@pytest.mark.parametrize("keep", [True, False], ids=["with a tape", "without a tape"])
 @pytest.mark.parametrize("decay", ["none", "delta"])
 def test_the_last_steps_of_a_silence_alone_have_a_gradient(decay: str, keep: bool) -> None:
     case = problem(
