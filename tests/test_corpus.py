@@ -150,6 +150,7 @@ def test_booleans_are_numbers_wherever_they_begin(empty, tmp_path):
         (("2,590", "3,100"), {"delimiter": ";", "decimal": ","}, [2.59, 3.1]),
         (("2,590", "3,100"), {"delimiter": ";", "decimal": "."}, [2590, 3100]),
         (("2,590", "3,1"), {"delimiter": ";"}, [2.59, 3.1]),
+        (("2.590,5", "3.100,25"), {"delimiter": ";"}, [2590.5, 3100.25]),
     ],
 )
 def test_a_comma_of_thousands_is_no_decimal_point(fields, options, expected, tmp_path):
@@ -335,6 +336,19 @@ class TestMcap:
         path.write_bytes(b"\x89MCAP0\r\n" + head + body + end + b"\x89MCAP0\r\n")
         with pytest.raises(FileFormatError, match="a chunk has 1099511627776 bytes"):
             read(path)
+
+
+def test_clocks_of_a_table_that_never_meet_are_said_aloud(tmp_path):
+    times = tables.TIMES.tolist()
+    long = {
+        "time": [*times, *(1_764_000_000 + t for t in times)],
+        "channel": ["gyro"] * tables.ROWS + ["gps"] * tables.ROWS,
+        "value": [*tables.X, *tables.Y],
+    }
+    for write in (tables.write_csv, tables.write_parquet):
+        dataset = read(write(tmp_path / "log", long), time_unit="s")
+        assert "the clocks of gyro and of gps have no time in common" in notes(dataset)
+        assert [trajectory.rows for trajectory in dataset] == [tables.ROWS, tables.ROWS]
 
 
 class TestHdf5:

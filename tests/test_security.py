@@ -250,6 +250,24 @@ def test_a_stream_without_input_or_output_ends_in_one_line(closed, tmp_path):
     )
 
 
+def test_a_closed_error_output_and_a_full_disk_end_as_they_should(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("time,x,y\n" + tables.BODY)
+    monkeypatch.setattr(sys, "stderr", None)
+    small = ["--model.name=gru", "--model.hidden_size=2", "--training.epochs=1"]
+    assert main(["train", "log.csv", "run", *small]) == 0
+    sys.stderr.close()
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        monkeypatch.setattr(full, "write", lambda text: os.write(full.fileno(), text.encode()))
+        assert main(["inspect", "log.csv"]) == 2
+        monkeypatch.undo()
+    line = "offbeat: error: the output can't be written: No space left on device\n"
+    assert capsys.readouterr().err == line
+
+
 @pytest.mark.parametrize("seen", [10**400, "x", [], {}, True, 1e400])
 def test_a_state_with_anything_for_a_number_changes_nothing(seen, tmp_path):
     record = json.loads(fuzz.make_state(tmp_path).read_text())

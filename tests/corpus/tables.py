@@ -117,6 +117,9 @@ KINDS: dict[str, Kind] = {
     "a stamp in seconds and microseconds": Kind(
         {"stamp/sec": SEC, "stamp/usec": REST // 1000, **XY}, XY
     ),
+    "a stamp in two columns of floats": Kind(
+        {"sec": SEC.astype(float), "nanosec": REST.astype(float), **XY}, XY
+    ),
     "a stamp in two columns that are named": Kind(
         {"a": SEC, "b": REST, **XY}, XY, options={"time_column": ["a", "b"]}
     ),
@@ -224,6 +227,17 @@ TEXTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
         "Bench Recorder\nRate,100\n\ntime,x,y\n" + BODY, {}, "the header is line 4",
     ),
     "a line of units": ("time,x,y\ns,m,deg\n" + BODY, {}, "line 2 is taken for the units"),
+    "a line of units and one of types": (
+        "time,x,y\ns,m,deg\nfloat,float,float\n" + BODY,
+        {},
+        "line 2 is taken for the units",
+    ),
+    "numbers above the header": (
+        "Model,TDS\nRecord Length,1000\nSample Interval,0.02\n\nTIME,x,y\n" + BODY,
+        {},
+        "the header is line 5",
+    ),
+    "a group above the header": ("imu,imu,imu\ntime,x,y\n" + BODY, {}, "the header is line 2"),
     "a header in a comment": ("# time,x,y\n" + BODY, {}, ""),
     "a header behind %": ("%time,x,y\n" + BODY, {}, ""),
     "comments between rows": (
@@ -267,6 +281,11 @@ REFUSED: dict[str, tuple[Columns, dict[str, Any], str]] = {
     ),
     "a stamp of a spreadsheet": ({"time": [1.764e18] * ROWS, **XY}, {}, "of another row"),
     "stamps of 0": ({"time": np.zeros(ROWS), **XY}, {}, "of another row and other values"),
+    "dates of either order": (
+        {"Date": ["11/12/2025"] * ROWS, "Time": of_day(NS), **XY},
+        {},
+        "has dates such as '11/12/2025'",
+    ),
     "several stamps": (
         {"imu/stamp/sec": SEC, "imu/stamp/nanosec": REST, "odom/stamp/sec": SEC,
          "odom/stamp/nanosec": REST, "x": X}, {}, "has several stamps, each in two columns",

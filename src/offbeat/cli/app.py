@@ -90,6 +90,8 @@ def run_commands(
     from offbeat.cli.option_groups import reader_options, training_options
     from offbeat.cli.parser import CommandParser
 
+    if sys.stderr is None:  # closed by the caller; progress bars and notes need one
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     groups = {"reader": reader_options, "training": training_options}
     parser = CommandParser(prog=prog, description=description, version=__version__)
     subcommands = parser.add_subcommands()
@@ -118,6 +120,8 @@ def run_commands(
         return 1
     except (OffbeatError, OSError) as error:
         said = parsers[command].spoken(str(error)) if command else str(error)
+        if isinstance(error, OSError) and error.filename is None and error.strerror:
+            said = f"the output can't be written: {error.strerror}"
         return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
     except KeyboardInterrupt:
         return _fail("interrupted; the same command continues from the last checkpoint", 130)

@@ -302,6 +302,7 @@ def stamp_columns(
         for one, two, unit in pairs:
             if time in (one, two):
                 return joined(one, two, unit)
+        _refuse_dates(path, names, time, options, sample)
         if dates and sample.is_text(time) and not _is_date(sample, time):
             return joined(dates[0], time, "date")
         return made(time)
@@ -320,6 +321,22 @@ def stamp_columns(
 
 
 _DATES = ("date", "day", "date_utc", "utc_date", "local_date")
+
+
+def _refuse_dates(
+    path: Path, names: list[str], time: str, options: TableOptions, sample: Sample
+) -> None:
+    """Raises an error for dates beside times of day that may be of either order."""
+    if form_of(_first(sample.texts(time))) != "of day":
+        return
+    for name in names:
+        usual = folded(name) in _DATES and name not in options.without
+        if usual and sample.is_text(name) and not _is_date(sample, name):
+            raise FileFormatError(
+                f"{path} has dates such as {_first(sample.texts(name))[:40]!r} in column {name!r}, "
+                "expected 2026-11-24, 2026/11/24 or 24.11.2026; leave them out with "
+                f"without=[{name}]"
+            )
 
 
 def _is_date(sample: Sample, name: str) -> bool:

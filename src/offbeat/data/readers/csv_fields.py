@@ -23,14 +23,16 @@ BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
 _NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$|^[+-]?(inf|infinity|nan)$"
 _INFINITE = r"^([+-]?)1\.#(INF|inf).*$"
 _THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
-_GROUPED_BY_POINTS = re.compile(r"[+-]?[1-9][0-9]{0,2}(\.[0-9]{3})+,[0-9]+")
+GROUPED_BY_POINTS = re.compile(r"[+-]?[1-9][0-9]{0,2}(\.[0-9]{3})+,[0-9]+")
+"""Numbers with a decimal comma, and a point for each thousand."""
+
 _GROUPED_BY_COMMAS = re.compile(_THOUSANDS)
 
 
 def number_in(text: str, decimal: str) -> float | None:
     """The number in a field, or None."""
     if decimal != ".":
-        if _GROUPED_BY_POINTS.fullmatch(text.strip()):
+        if GROUPED_BY_POINTS.fullmatch(text.strip()):
             text = text.replace(".", "")
         text = text.replace(".", "?").replace(decimal, ".")
     elif "," in text and _GROUPED_BY_COMMAS.fullmatch(text.strip()):
@@ -98,7 +100,7 @@ class Converter:
         nothing = pa.scalar(None, pa.string())
         texts = pc.if_else(pc.is_in(texts, pa.array(self.missing, pa.string())), nothing, texts)
         if self.decimal != ".":
-            grouped = pc.match_substring_regex(texts, f"^{_GROUPED_BY_POINTS.pattern}$")
+            grouped = pc.match_substring_regex(texts, f"^{GROUPED_BY_POINTS.pattern}$")
             texts = pc.if_else(grouped, pc.replace_substring(texts, ".", ""), texts)
             texts = pc.replace_substring(pc.replace_substring(texts, ".", "?"), self.decimal, ".")
         try:

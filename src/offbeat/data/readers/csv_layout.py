@@ -22,6 +22,13 @@ DELIMITERS = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 """Beginnings of lines of comment."""
 
+_TIMES = frozenset(TIME_NAMES)
+_TYPES = frozenset(  # words in a line of types below a header
+    (
+        *("float", "float32", "float64", "double", "int", "int32", "int64", "integer", "number"),
+        *("bool", "boolean", "string", "str", "text", "datetime", "time", "long", "real"),
+    )
+)
 _LINES = 200  # in which the table must begin
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
 _SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
@@ -102,7 +109,14 @@ def _layout(
     """The table as this delimiter has it, and whether header and rows agree."""
     if not rows:
         return None, False
-    at = next((i for i in range(len(rows)) if _begins(rows, i, delimiter)), None)
+    at = None
+    for i in range(len(rows)):
+        if _begins(rows, i, delimiter):
+            at = i if at is None else at
+            # Lines of description may hold numbers, too: the table is below a column of times.
+            if i and _is_named(rows[_header(rows, i, delimiter)[0] or 0][1]):
+                at = i
+                break
     if at is None:  # a header alone, or no numbers
         plain = [i for i, row in enumerate(rows) if not is_comment(row[1][0])]
         head = plain[0] if plain else 0
@@ -120,18 +134,18 @@ def _layout(
     head = above
     names = _names(rows[head][1], delimiter)
     notes: list[str] = []
-    if units is not None:
+    if units:
         names = tuple(
             f"{name} [{unit}]" if unit.strip("-") and name else name
             for name, unit in itertools.zip_longest(names, units, fillvalue="")
         )
-        notes.append(f"line {rows[at - 1][0]} is taken for the units of the columns")
+        notes.append(f"line {rows[head + 1][0]} is taken for the units of the columns")
     if len(names) == width - 1 and not any(row[1][-1].strip() for row in _body(rows, at, width)):
         names = (*names, "")  # all rows end in a delimiter
     skipped = [row for row in rows[:head] if not is_comment(row[1][0])]
     if skipped:
         notes.append(f"the header is line {rows[head][0]}; lines above it are left out")
-    first = rows[head if units is None else at - 1][0] + 1
+    first = rows[at - 1][0] + 1
     return CsvLayout(delimiter, names, rows[head][0], first, tuple(notes)), len(names) == width
 
 
@@ -166,26 +180,29 @@ def _is_data(fields: list[str], delimiter: str) -> bool:
 
 def _is_named(fields: list[str]) -> bool:
     """Whether a row names a column of times, as a header does."""
-    return any(folded(field) in TIME_NAMES for field in fields if field[:1] not in "0123456789")
+    words = (field for field in fields if field[:1] not in "0123456789+-." and len(field) < 60)
+    return any(folded(word) in _TIMES for word in words)
 
 
 def _header(rows: list[Row], at: int, delimiter: str) -> tuple[int | None, list[str] | None]:
     """The row of the header above the first row of numbers, and the fields of a row of units."""
-    width = len(rows[at][1])
     if at == 0:
         return None, None
-    above = [at - 1, at - 2] if at > 1 else [at - 1]
-    units = [field.strip() for field in rows[at - 1][1]]
-    bare = [unit.strip("[]()") for unit in units]
-    if (
-        at > 1
-        and len(units) == len(_names(rows[at - 2][1], delimiter))
-        and any(bare)
-        and all(not unit or unit == "-" or is_unit(unit) for unit in bare)
-        and not (_is_named(units) and not _is_named(rows[at - 2][1]))
-    ):
-        return at - 2, bare
-    for i in above:
+    width = len(rows[at][1])
+    units: list[str] | None = None
+    head = at - 1
+    while head > 0 and len(rows[head][1]) == len(_names(rows[head - 1][1], delimiter)):
+        words = [field.strip().strip("[]()") for field in rows[head][1]]
+        if _is_named(rows[head][1]) and not _is_named(rows[head - 1][1]):
+            break
+        if any(words) and all(not word or word == "-" or is_unit(word) for word in words):
+            units = words
+        elif not all(word.casefold() in _TYPES for word in words):
+            break
+        head -= 1
+    if head < at - 1:
+        return head, units
+    for i in [at - 1, at - 2][: min(at, 2)]:
         if len(_names(rows[i][1], delimiter)) in (width, width - 1) and (
             not is_comment(rows[i][1][0]) or i == at - 1
         ):

@@ -18,7 +18,13 @@ from offbeat.data.cleaning.clocks import NANOSECONDS_PER, state_time_unit, time_
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullValueError, gather, line_error, with_joined
 from offbeat.data.readers.columns import Columns, Gathered, TableOptions, listed, recordings
-from offbeat.data.readers.csv_fields import BOOLEANS, MISSING, Converter, number_in
+from offbeat.data.readers.csv_fields import (
+    BOOLEANS,
+    GROUPED_BY_POINTS,
+    MISSING,
+    Converter,
+    number_in,
+)
 from offbeat.data.readers.csv_layout import CsvLayout, find_csv_layout, is_comment
 from offbeat.data.readers.options import names as names_of
 from offbeat.data.readers.stamps import (
@@ -257,11 +263,12 @@ class _CsvFile:
         if self.layout.delimiter == ",":
             return ".", []
         fields = [f for column in sample.fields.values() for f in column]
-        commas = any(_COMMA.fullmatch(f) for f in fields)
+        commas = any(_COMMA.fullmatch(f) or GROUPED_BY_POINTS.fullmatch(f) for f in fields)
         points = any("." in f and number_in(f, ".") is not None for f in fields)
         if not commas or points:
             return ".", []
-        if all(_GROUPED.fullmatch(f) for f in fields if _COMMA.fullmatch(f)):
+        plain = [f for f in fields if _COMMA.fullmatch(f)]
+        if plain and all(_GROUPED.fullmatch(f) for f in plain):
             first = next(f for f in fields if _COMMA.fullmatch(f))
             raise InputError(
                 f"{self.path} has numbers such as {first!r}, whose comma may be a decimal point or "
@@ -302,7 +309,7 @@ class _CsvFile:
             if columns.rest_unit == "date":
                 types |= {columns.time: pa.string(), columns.rest: pa.string()}
             elif columns.rest is not None:
-                types |= {columns.time: pa.int64(), columns.rest: pa.int64()}
+                types |= {columns.time: pa.float64(), columns.rest: pa.float64()}
             elif columns.time:
                 types[columns.time] = clock
             converter = Converter(columns, self.missing, self.decimal or ".")
