@@ -39,10 +39,11 @@ else:
     compiled = _compiled
     why_not = ""
 
-TAPE_LIMIT = 256 * 2**20
+TAPE_LIMIT = 32 * 2**20
 """Bytes. A forward pass stores inner activations for its backward pass up to this size. Beyond it
 stores only the states (`state_size` numbers per row, twice), and the backward pass recomputes the
-rest, a few rows at a time (`benchmarks/scaling.py` measures the cost)."""
+rest, a few rows at a time (`benchmarks/scaling.py` measures the cost). Larger blocks of memory are
+mapped anew at each call, which can cost more than to compute twice."""
 
 ROWS_AT_ONCE = 0
 """Rows whose weight gradients are added together; 0 for as many as have eight evaluations of the
