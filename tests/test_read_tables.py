@@ -147,7 +147,7 @@ class TestCsvOfOtherPrograms:
         assert (dataset.meta["time_unit"], dataset.meta["clock_start"]) == ("100ns", [start])
 
     def test_is_read_over_the_borders_of_its_blocks(self, text_file, monkeypatch):
-        monkeypatch.setattr("offbeat.data.readers.table._BLOCK", 4096)
+        monkeypatch.setattr("offbeat.data.readers.csv_file._BLOCK", 4096)
         random = np.random.default_rng(0)
         values = random.normal(size=(2000, 3))
         rows = "".join(

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import join_stamp
-from offbeat.data.readers.columns import Coded, Coder, Columns, Gathered
+from offbeat.data.readers.columns import Columns
+from offbeat.data.readers.gathered import Coded, Coder, Gathered
 from offbeat.data.readers.stamps import date_and_time, over_midnight, stamps_of
 from offbeat.errors import FileFormatError
 

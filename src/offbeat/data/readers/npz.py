@@ -14,16 +14,8 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import join_stamp, state_time_unit
 from offbeat.data.memory import require_memory
-from offbeat.data.readers.columns import (
-    LABEL_NAMES,
-    Coded,
-    Coder,
-    Columns,
-    Gathered,
-    TableOptions,
-    recordings,
-    stamp_columns,
-)
+from offbeat.data.readers.columns import LABEL_NAMES, Columns, TableOptions, stamp_columns
+from offbeat.data.readers.gathered import Coded, Coder, Gathered, recordings
 from offbeat.data.readers.stamps import date_and_time, form_of, over_midnight, stamps_of
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS

@@ -22,7 +22,8 @@ from offbeat.data.readers.batches import (
     is_text,
     line_error,
 )
-from offbeat.data.readers.columns import Columns, TableOptions, columns_in, recordings
+from offbeat.data.readers.columns import Columns, TableOptions, columns_in
+from offbeat.data.readers.gathered import recordings
 from offbeat.data.readers.stamps import EXAMPLE, form_of
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS

@@ -12,7 +12,8 @@ from pathlib import Path
 from offbeat.data.cleaning.clocks import split_unit, time_unit_in
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.batches import NullValueError, gather
-from offbeat.data.readers.columns import Columns, recordings
+from offbeat.data.readers.columns import Columns
+from offbeat.data.readers.gathered import recordings
 from offbeat.data.readers.table import read_csv
 from offbeat.data.recording import Recording, Signal
 from offbeat.data.source import require_file
