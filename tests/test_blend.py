@@ -218,7 +218,7 @@ def test_answers_stay_in_the_range_of_training_and_say_where_they_are_beyond(ble
 
 def test_bins_of_lengths_end_at_the_longest():
     edges = AgeBins.of_lengths(0.01, 0.12, 0.2).edges
-    assert edges.tolist() == pytest.approx([0.015, 0.03, 0.06, 0.2])
+    assert edges.tolist() == pytest.approx([0.0153, 0.0306, 0.0612, 0.2])
 
 
 # --- with models ----------------------------------------------------------------------------------

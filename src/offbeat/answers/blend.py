@@ -28,7 +28,7 @@ from offbeat.answers.both_sides import (
     reversed_in_time,
 )
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
-from offbeat.baselines.base import BASELINES, Array, causal_baselines
+from offbeat.baselines.base import BASELINES, Array
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.stack import (
     LEVELS,
@@ -283,7 +283,8 @@ def fit_blend(
         backward: trained on reversed trajectories; without one, a fill from both sides uses the
             forward model's causal predictions alone.
         tasks: how tasks are drawn; by default with a horizon of sixteen typical gaps.
-        causal: names of the causal baselines; by default all that are registered.
+        causal: names of the causal baselines; by default all that are registered and
+            not slow.
         two_sided: names of the baselines of fills from both sides, likewise.
         masks_of_data: the data has masked values like those that will be asked for, so that no
             others are masked than those after a cut.
@@ -317,9 +318,11 @@ def fit_blend(
         ]
 
     before, both = (GIVEN_CAUSAL, GIVEN_TWO_SIDED) if masks_of_data else (CAUSAL, TWO_SIDED)
-    causal = causal_baselines() if causal is None else causal
+    usual = {name: kind for name, kind in BASELINES.items() if not kind.slow}
+    if causal is None:
+        causal = tuple(name for name, kind in usual.items() if kind.causal)
     if two_sided is None:
-        two_sided = tuple(name for name, kind in BASELINES.items() if not kind.causal)
+        two_sided = tuple(name for name, kind in usual.items() if not kind.causal)
     parts = drawn(before, 0)
     stack, cells, held_out = fit_stack(causal, *parts, span_s=span, gap_s=gap)
     models = model_rows(model, parts[1], seed=seed)

@@ -35,12 +35,15 @@ class Baseline(ABC):
         causal: whether a prediction uses only what was observed before its row.
         flexible: whether it has so many parameters that its errors on the tasks it was fitted to
             are smaller than those on others; then weights are fitted to cross-validated errors.
+        slow: whether its fit takes much longer than those of the others; then it is used where it
+            is asked for by name.
         mean: (channels,) mean of the observed values of training, in units of the channels.
         scale: (channels,) their standard deviation; 1 where a channel is constant.
     """
 
     causal: ClassVar[bool] = True
     flexible: ClassVar[bool] = False
+    slow: ClassVar[bool] = False
 
     mean: Array
     scale: Array

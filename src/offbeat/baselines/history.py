@@ -112,9 +112,9 @@ class AgeBins:
         longest = usual if longest is None else max(usual, longest)
         ratio = max(usual / (1.5 * gap), 1.0)
         count = int(np.clip(np.round(np.log2(ratio)), 0, LONGEST_BIN))
-        edges = 1.5 * gap * 2.0 ** np.arange(count + 1)
-        if count:
-            edges = 1.5 * gap * ratio ** (np.arange(count + 1) / count)
+        steps = np.arange(count + 1) / max(count, 1)
+        # A little longer, so that rounding never decides about multiples of the gap.
+        edges = 1.02 * 1.5 * gap * ratio**steps
         edges[-1] = max(edges[-1], longest)
         return cls(np.asarray(edges))
 

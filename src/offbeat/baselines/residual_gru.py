@@ -46,6 +46,7 @@ class ResidualGru(CausalBaseline):
     """
 
     flexible = True
+    slow = True
 
     gap: Array  # () s, typical one
     edges: Array  # (bins,) s, of AgeBins

@@ -187,9 +187,7 @@ class Ridge(CausalBaseline):
     def estimate(self, tasks: Dataset) -> None:
         """See `Baseline`."""
         gap, longest = typical_gap(tasks), longest_age(tasks)
-        self.edges = (
-            1.02 * AgeBins.of(tasks).edges
-        )  # not at multiples of a gap, where rounding decides
+        self.edges = AgeBins.of(tasks).edges
         self.averages = np.geomspace(4 * gap, max(longest, 8 * gap), AVERAGES)
         known = [np.where(t.known, t.values, np.nan) for t in tasks]
         every = np.concatenate([*known, np.where(np.isfinite(self.mean), self.mean, 0.0)[None]])

@@ -91,6 +91,8 @@ def train_command(
     )
     if chosen is not None:
         reader, split = dict(chosen.reader), chosen.split
+        for note in chosen.notes:
+            print(f"offbeat: {note}", file=sys.stderr)
     as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
     open_model = model == ModelConfig()
     learned = learn(
@@ -108,7 +110,7 @@ def train_command(
         seed=seed,
         device=device,
     )
-    for note in learned.notes:
+    for note in learned.notes[len(() if chosen is None else chosen.notes) :]:
         print(f"offbeat: {note}", file=sys.stderr)
     blend, made = learned.blend, learned.blend.forward
     assert made is not None
