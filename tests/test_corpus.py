@@ -179,6 +179,15 @@ def test_a_table_that_needs_a_choice_asks_for_it_in_one_line(name, form, tmp_pat
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["index", "id", "I"])
+def test_a_column_that_counts_is_no_instance(name, tmp_path):
+    times = tables.TIMES.copy()
+    times[5] = times[4]
+    for numbers in (np.arange(tables.ROWS), np.arange(tables.ROWS) // 20):
+        columns = {"time": times, name: numbers, "x": tables.X}
+        assert read(tables.write_csv(tmp_path / "log", columns)).names == (name, "x")
+
+
 def test_rows_that_would_be_lost_are_merged_when_asked(tmp_path):
     path = tables.write_csv(tmp_path / "log", {"time": [0, 0, 1, 1, 2, 2], "x": range(6)})
     for choice, expected in (("last", [1, 3, 5]), ("first", [0, 2, 4]), ("mean", [0.5, 2.5, 4.5])):

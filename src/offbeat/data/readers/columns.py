@@ -437,8 +437,10 @@ def _instance_column(
             if stamp.rest is not None:
                 stamps = list(map(str, zip(stamps, sample.texts(stamp.rest), strict=False)))
             pairs = set(zip(stamps, numbers.tolist(), strict=False))
-            few = len(set(numbers.tolist())) <= _MOST_INSTANCES
-            if few and len(set(stamps)) < len(stamps) == len(pairs) == len(numbers):
+            count = len(set(numbers.tolist()))
+            few = count <= min(_MOST_INSTANCES, len(numbers) // 2)
+            shared = 5 * (len(stamps) - len(set(stamps))) >= len(stamps)  # not by chance
+            if few and shared and len(stamps) == len(pairs) == len(numbers):
                 return name
     return None
 
