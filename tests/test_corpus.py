@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import json
 import lzma
 import struct
 from pathlib import Path
@@ -590,6 +591,24 @@ def test_options_of_readers_are_typed_on_the_command_line(options, expected, mon
     assert main(["inspect", "log.csv", *words]) == 0
     plain = {n: list(v) if isinstance(v, tuple) else v for n, v in given["reader"].items()}
     assert plain == {n: list(v) if isinstance(v, tuple) else v for n, v in expected.items()}
+
+
+@pytest.mark.parametrize(
+    "names",
+    [["left speed"], ["null", "yes", "on", "x"], ["a,b", "1e3", "x: y"], ["a'b", "#c", "~"]],
+)
+def test_names_in_the_command_of_inspect_are_read_as_they_are(names, tmp_path, capsys):
+    columns = {name: tables.X + i for i, name in enumerate(names)}
+    path = tmp_path / "log.csv"
+    header = ",".join(f'"{name}"' for name in ("time", *names, "kept"))
+    rows = zip(tables.TIMES, *columns.values(), tables.Y, strict=True)
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    assert main(["inspect", str(path), f"--reader.actions={json.dumps(names)}", "--json"]) == 0
+    command = json.loads(capsys.readouterr().out)["advice"]["command"]
+    given = [word for word in command if word.startswith("--reader.actions=")]
+    assert main(["inspect", str(path), *given, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["channels"]
+    assert [c["name"] for c in told if c["role"] == "action"] == names
 
 
 def inspect_with(given):

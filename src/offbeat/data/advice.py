@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import yaml
+
 from offbeat.data.plan import CHOSEN, plan
 from offbeat.data.trajectory import Dataset
 
@@ -66,4 +68,5 @@ def _text(value: Any) -> str:
 def _quoted(text: str) -> str:
     """Quotes a string for YAML."""
     plain = text.replace("_", "").replace(".", "").isalnum() and text[0].isalpha()
-    return text if plain else json.dumps(text)
+    # Such as null, yes and 1e3, which are no texts in YAML.
+    return text if plain and yaml.safe_load(text) == text else json.dumps(text)
