@@ -70,11 +70,24 @@ def test_the_commands_of_a_page_are_found():
     ]
 
 
-@pytest.mark.slow
-def test_the_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+SMALL = "model=ob.ModelConfig(hidden_size=4), training=ob.TrainConfig(epochs=1)"
+
+
+@pytest.fixture
+def logs(tmp_path, monkeypatch):
+    """log.csv and arm.csv in the working directory: a pendulum at 50 Hz."""
     monkeypatch.chdir(tmp_path)
+    t = 0.02 * np.arange(1000)
+    lines = [f"{time:.2f},{np.sin(time):.5f},{np.cos(time):.5f}" for time in t]
+    for name in ("log.csv", "arm.csv"):
+        (tmp_path / name).write_text("\n".join(["time,x,v", *lines]))
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs(logs, tmp_path, capsys):
     scope: dict[str, object] = {}
-    run_python("README.md", scope)
+    run_python("README.md", scope, quick=('"runs/arm")', f'"runs/arm", {SMALL})'))
+    assert scope["low"].shape == (2, 2)
     assert "last_value" in capsys.readouterr().out
     assert (tmp_path / "runs/first/copy/model.safetensors").is_file()
     scores = ob.evaluate(scope["again"], scope["test"]).scores
@@ -93,24 +106,22 @@ def test_the_commands_of_the_readme_run(tmp_path, monkeypatch):
     assert (tmp_path / "predictions.csv").is_file()
 
 
-def test_the_python_of_the_answers_page_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    quick = ("validation, out=", "validation, ob.TrainConfig(epochs=1), out=")
-    run_python("docs/answers.md", {}, quick=quick)
+@pytest.mark.slow
+def test_the_python_of_the_answers_page_runs(logs, capsys):
+    scope: dict[str, object] = {}
+    run_python("docs/answers.md", scope, quick=('"runs/python")', f'"runs/python", {SMALL})'))
     assert "pchip" in capsys.readouterr().out
+    assert scope["filled"].rows == 1999  # from 0 to 19.98 s at 100 Hz
+    assert (scope["low_x"] <= scope["high_x"]).all()
 
 
-def test_the_commands_of_the_answers_page_run(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
-    t = 0.02 * np.arange(1000)
-    lines = [f"{time:.2f},{np.sin(time):.5f},{np.cos(time):.5f}" for time in t]
-    (tmp_path / "log.csv").write_text("\n".join(["time,x,v", *lines]))
+@pytest.mark.slow
+def test_the_commands_of_the_answers_page_run(logs):
     text = next(block for block in blocks(ROOT / "docs/answers.md", "") if "log.csv" in block)
     for _, *arguments in commands(text):
         small = ["--training.epochs=1", "--model.hidden_size=4"] if arguments[0] == "train" else []
         assert main([*arguments, *small]) == 0, arguments
-    assert (tmp_path / "ahead.csv").is_file()
+    assert Path("ahead.csv").is_file()
 
 
 @pytest.mark.parametrize("page", ["docs/readers.md", "docs/readers_robots.md"])
