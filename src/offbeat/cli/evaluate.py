@@ -35,10 +35,11 @@ def evaluate_command(
 ) -> None:
     """Score a trained model and simple baselines on the same values.
 
-    One-step-ahead predictions are compared with the last observed value; fills of masked values
-    with the last value, linear interpolation and PCHIP; forecasts at the horizons, if any are
-    given, with the last value and constant velocity. Errors are in the channels' units and, over
-    all channels, in scaled units.
+    Predictions, fills and forecasts of a blend are compared with its model alone and with all its
+    baselines. One-step-ahead predictions of a model are compared with the last observed value;
+    fills of masked values with the last value, linear interpolation and PCHIP; forecasts at the
+    horizons, if any are given, with the last value and constant velocity. Errors are in the
+    channels' units and, over all channels, in scaled units.
 
     Args:
         model: folder of a run or of a checkpoint.
@@ -50,7 +51,8 @@ def evaluate_command(
         mask: what is masked: rows, values, bursts or dropout.
         burst_rows: length of a burst or of a dropout in rows.
         burst_s: length of a burst or of a dropout in seconds, instead of in rows.
-        horizons: of the forecasts in seconds, such as --horizons 0.1,0.5.
+        horizons: of the forecasts in seconds, such as --horizons 0.1,0.5; of a blend, by default
+            parts of the longest one that it was trained for.
         out: JSON file for the scores.
         figure: .png, .pdf or .svg of one trajectory, its masked values and the fills.
         channels: to plot; by default the first four.

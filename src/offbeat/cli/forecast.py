@@ -35,7 +35,8 @@ def forecast_command(
         data: the log, of any format that Offbeat reads.
         out: .csv or .parquet file with columns trajectory, time (s), horizon (s after the last
             row), one per channel, and one `name|observed` per channel, which is false: these values
-            were not measured.
+            were not measured. With a blend also `name|low` and `name|high`, the ends of the
+            interval of 90 %, and `name|beyond`, true where a forecast is beyond what was trained.
         horizons: seconds after the last row, such as --horizons 0.1,0.5,1.0.
         figure: .png, .pdf or .svg of the end of one trajectory, the forecast, last value and
             constant velocity.

@@ -38,9 +38,10 @@ def impute_command(
         data: the log, of any format that Offbeat reads; missing and masked values are filled.
         out: .csv or .parquet file with columns trajectory, time (s), one per channel, and one
             `name|observed` per channel: true where the value was measured, false where it was
-            filled.
-        mode: causal, from the past alone; two_sided, from past and future, which needs a run
-            trained with --two_sided. By default two_sided where the run is.
+            filled. With a blend also `name|low` and `name|high`, the ends of the interval of 90 %,
+            and `name|beyond`, true where an answer is beyond what was trained.
+        mode: causal, from the past alone; two_sided, from past and future, the default of a run
+            with a blend, which offbeat train makes.
         rate_hz: add rows at this rate where no row is within half a period, so that times at which
             no sensor reported are filled too. The log is then not split at outages, unless
             --reader.max_gap_s is given.

@@ -32,7 +32,8 @@ def predict_command(
         model: folder of a run or of a checkpoint.
         data: the log, of any format that Offbeat reads.
         out: .csv or .parquet file with columns trajectory, time (s, as times), clock_UNIT (what the
-            clock of the log shows, in its own unit, where that differs) and one per channel.
+            clock of the log shows, in its own unit, where that differs) and one per channel. With
+            a blend also `name|low`, `name|high` and `name|beyond`, as of offbeat impute.
         times: seconds since the first row of each trajectory, in any unit of the log, such
             as --times 0.25,0.5; by default the times of the rows. With --reader.start clock,
             seconds on the clock of the log. A data set that Offbeat saved keeps the times it was
