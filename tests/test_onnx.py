@@ -26,7 +26,9 @@ from offbeat import (
     export_onnx,
     save_model,
 )
-from offbeat.baselines import fit_baseline
+from offbeat.answers.blend import Blend, fit_blend
+from offbeat.answers.saved import save_blend
+from offbeat.baselines import BASELINES, LastValue, fit_baseline
 from offbeat.cli.app import main
 from offbeat.data.tasks import draw_tasks
 from offbeat.export.exporter import StreamStep, _traceable
@@ -165,6 +167,164 @@ def test_an_exported_model_that_corrects_a_baseline_predicts_what_its_stream_pre
     again = OnnxStream(tmp_path / "model.onnx")
     again.restore(onnx.state())
     assert np.array_equal(again.predict(ahead), onnx.predict(ahead))
+
+
+# --- blends ---------------------------------------------------------------------------------------
+
+FEW = ("last_value", "damped_slope", "kalman_short")
+
+
+def small_blend(model: Any = None, causal: Any = FEW) -> Blend:
+    return fit_blend(
+        TRAIN, VALIDATION, model, tasks=TASKS, causal=causal, two_sided=["linear"], count=40
+    )
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> tuple[Blend, Path]:
+    """A blend of baselines alone, and its file."""
+    blend, path = small_blend(), tmp_path_factory.mktemp("blend") / "blend.onnx"
+    export_onnx(blend, path)
+    return blend, path
+
+
+def check_blend(blend: Blend, path: Path, tolerance: float) -> None:
+    """Predictions and intervals, with dropouts, a late message and values out of any range."""
+    live, onnx = Stream(blend, late="reorder"), OnnxStream(path, late="reorder")
+    one, random = VALIDATION[0], np.random.default_rng(0)
+    spread, moved = blend.stack.scale, []
+    for row in range(60):
+        for ahead in (0.0, 0.03, 0.3, 4.0):
+            t = float(one.times[row]) + ahead
+            expected, got = live.predict(t), onnx.predict(t)
+            size = np.maximum(spread, np.abs(expected))
+            assert np.abs((got - expected) / size).max() < tolerance
+            moved.append(expected)
+            for level in (0.33, 0.9):
+                wide, same = live.half_width(t, level), onnx.half_width(t, level)
+                np.testing.assert_allclose(same, wide, rtol=1e-9)
+        seen = one.observed[row] & (random.random(3) < 0.8) & (not 20 <= row < 35)
+        values = np.where(seen, one.values[row], np.nan)
+        if row == 40:
+            values = np.array([1e30, -np.inf, -1e200])
+        for each in (live, onnx):
+            assert each.observe(float(one.times[row]), values) == "new"
+            if row == 12:
+                assert each.observe(float(one.times[10]) + 0.01, {"b": 0.5}) == "reordered"
+    assert (np.std(moved, axis=0) > 0).all()
+    assert live.counters == onnx.counters
+
+
+def test_an_exported_blend_of_baselines_is_its_stream_in_double_precision(few: Any) -> None:
+    check_blend(*few, 1e-12)
+
+
+def test_every_baseline_of_a_blend_by_default_can_be_exported(tmp_path: Path) -> None:
+    blend = small_blend(causal=None)
+    assert list(blend.stack.members) == [
+        name for name, kind in BASELINES.items() if kind.causal and not kind.slow
+    ]
+    # Weights of all members, whatever they are good for here.
+    blend.stack.weights[:] = 1 / len(blend.stack.members)
+    export_onnx(blend, tmp_path / "blend.onnx")
+    check_blend(blend, tmp_path / "blend.onnx", 1e-9)
+
+
+@pytest.mark.slow
+def test_a_blend_with_a_network_as_a_baseline_can_be_exported(tmp_path: Path) -> None:
+    blend = small_blend(causal=["last_value", "residual_gru"])
+    blend.stack.weights[:] = 0.5
+    export_onnx(blend, tmp_path / "blend.onnx")
+    check_blend(blend, tmp_path / "blend.onnx", 1e-9)
+
+
+@pytest.mark.parametrize("corrects", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_blend_is_exported_with_its_model(corrects: bool, tmp_path: Path) -> None:
+    sizes: dict[str, Any] = {"hidden_size": 4, "decoder_units": (4,), "field_units": (4,)}
+    model: Any = draw_weights(make_model("anchored_ode_gru_d", TRAIN, **sizes))
+    if corrects:
+        tasks = draw_tasks(TRAIN, TASKS, 60, seed=9)
+        model = CorrectedModel.of(model, fit_baseline("damped_slope", tasks), tasks)
+    blend = small_blend(model)
+    blend.gamma[:] = 0.5
+    export_onnx(blend, tmp_path / "blend.onnx")
+    check_blend(blend, tmp_path / "blend.onnx", 1e-5)
+
+
+def test_a_restored_onnx_stream_of_a_blend_goes_on_bit_for_bit(few: Any) -> None:
+    blend, path = few
+    stream, again = OnnxStream(path), OnnxStream(path)
+    for row in range(10):
+        stream.observe(float(row), [0.1 * row, 0.0, np.nan])
+    again.restore(json.loads(json.dumps(stream.state(), allow_nan=False)))
+    assert np.array_equal(again.predict(9.5), stream.predict(9.5))
+    assert np.array_equal(again.interval(9.5, 0.7), stream.interval(9.5, 0.7))
+    with pytest.raises(InputError, match=r"at most 0\.98"):
+        stream.interval(9.5, 0.99)
+    with pytest.raises(InputError):
+        Stream(blend).restore(stream.state())
+
+
+def test_the_file_of_a_blend_tells_the_levels_of_its_half_widths(few: Any) -> None:
+    """As docs/live.md tells it, for any runtime."""
+    import onnxruntime
+
+    blend, path = few
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    record = json.loads(session.get_modelmeta().custom_metadata_map["offbeat"])
+    assert [i.name for i in session.get_inputs()] == ["t", "values", *record["base"]]
+    state = {name: np.array(value) for name, value in record["base"].items()}
+    stream, values = Stream(blend), np.array([[0.5, np.nan, 0.1]])
+    out = session.run(None, {"t": np.array([0.0]), "values": values, **state})
+    stream.observe(0.0, values[0])
+    state = dict(zip(state, out[2:], strict=True))
+    mean, half = session.run(None, {"t": np.array([0.2]), "values": values + np.nan, **state})[:2]
+    low, high = stream.interval(0.2, 0.8)
+    half = half[..., record["levels"].index(0.8)]
+    np.testing.assert_allclose([(mean - half)[0], (mean + half)[0]], [low, high], rtol=1e-9)
+
+
+def test_a_baseline_that_no_graph_can_hold_is_named(tmp_path: Path) -> None:
+    class Branching(LastValue):
+        def read(self, state: Any, time: Any) -> Any:
+            last = super().read(state, time)
+            return last if float(last.max()) > 0 else 2 * last
+
+    BASELINES.register("branching", Branching)
+    try:
+        blend = small_blend(causal=["mean", "branching"])
+        with pytest.raises(InputError, match="the baseline 'branching' of the blend cannot") as e:
+            export_onnx(blend, tmp_path / "blend.onnx")
+        assert "\n" not in str(e.value)
+    finally:
+        BASELINES.unregister("branching")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_exports_the_blend_of_a_run_and_streams_it_without_torch(
+    few: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    blend, _ = few
+    save_blend(blend, tmp_path / "run")
+    out = tmp_path / "run.onnx"
+    assert main(["export", str(tmp_path / "run"), str(out), "--json"]) == 0
+    assert json.loads(capfd.readouterr().out)["model"] == "blend"
+    code = (
+        "import sys; sys.modules['torch'] = None\n"
+        "from offbeat.cli.app import main; sys.exit(main(sys.argv[1:]))"
+    )
+    lines = b'{"t": 0.0, "values": {"a": 0.5}}\n{"predict": 0.2}\n'
+    call = [sys.executable, "-c", code, "stream", str(out)]
+    found = subprocess.run(call, input=lines, capture_output=True, check=False)
+    assert found.returncode == 0, found.stderr
+    answer = json.loads(found.stdout.splitlines()[1])
+    stream = Stream(blend)
+    stream.observe(0.0, {"a": 0.5})
+    assert list(answer["prediction"].values()) == pytest.approx(stream.predict(0.2).tolist())
+    assert list(answer["low"].values()) == pytest.approx(stream.interval(0.2)[0].tolist())
+
+
+# --- the file -------------------------------------------------------------------------------------
 
 
 def test_any_runtime_can_run_the_file_from_what_stands_in_it(exported: Any) -> None:

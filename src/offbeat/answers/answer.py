@@ -75,7 +75,7 @@ class Answer(Trajectory):
                 "these predictions have no intervals: they are of a model alone; fit a blend "
                 "(offbeat train, offbeat.fit_blend), whose answers have them"
             )
-        return self.widths.at(self.key, self.unit)
+        return np.asarray(self.widths.at(self.key, self.unit))
 
     def slice(self, start: int, stop: int) -> Answer:
         """The rows from `start` up to, not including, `stop`."""

@@ -28,8 +28,9 @@ from offbeat.answers.both_sides import (
     reversed_in_time,
 )
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
-from offbeat.baselines.base import BASELINES, Array
+from offbeat.baselines.base import BASELINES, Array, namespace
 from offbeat.baselines.history import typical_gap
+from offbeat.baselines.simple import as_index, as_kind, channels_of
 from offbeat.baselines.stack import (
     LEVELS,
     Stack,
@@ -122,10 +123,10 @@ class Blend:
             answers.append(self._answer(trajectory, values, self.widths, key, unit, beyond))
         return answers
 
-    def corrected(
-        self, base: Array, model: Array | None, kind: Array
-    ) -> tuple[Array, NDArray[np.bool_]]:
+    def corrected(self, base: Any, model: Any, kind: Any) -> tuple[Any, Any]:
         """The causal answer: base + gamma (model - base), within the range of answers.
+
+        This method, `half_widths` and `limited` work on NumPy arrays and on torch tensors.
 
         Args:
             base: (rows, channels) of the stack.
@@ -135,13 +136,15 @@ class Blend:
         Returns:
             The answer, and where it is beyond what was trained; see `Answer.beyond`.
         """
-        key, age, last = kind[..., 0].astype(np.int64), kind[..., 2], kind[..., 3]
+        xp = namespace(base)
+        key, age, last = as_index(kind[..., 0]), kind[..., 2], kind[..., 3]
+        low, high = as_kind(self.stack.low, base), as_kind(self.stack.high, base)
         beyond = age > float(self.stack.keys.bins.edges[-1]) * (1 + 1e-6)
         values = base
         if model is not None:
-            gamma = np.where(beyond, 0.0, self.gamma[key, np.arange(self.channels)])
+            gamma = xp.where(beyond, 0.0, as_kind(self.gamma, base)[key, channels_of(base)])
             values = self.stack.bounded(base + gamma * (model - base), last)
-        return values, beyond | (values <= self.stack.low) | (values >= self.stack.high)
+        return values, beyond | (values <= low) | (values >= high)
 
     def half_width(self, kind: Array, level: float) -> Array:
         """(rows, channels) half widths of causal intervals, in original units.
@@ -150,14 +153,21 @@ class Blend:
             kind: (rows, channels, 4) of `Keys.read`.
             level: probability of the interval.
         """
-        return half_width(
-            self.widths.at(kind[..., 0].astype(np.int64), self.stack.keys.unit(kind)), level
-        )
+        return half_width(self.half_widths(kind), level)
 
-    def limited(self, values: Array) -> Array:
+    def half_widths(self, kind: Any) -> Any:
+        """(rows, channels, levels) half widths at every level of `intervals.LEVELS`.
+
+        Args:
+            kind: as of `half_width`.
+        """
+        return self.widths.at(as_index(kind[..., 0]), self.stack.keys.unit(kind))
+
+    def limited(self, values: Any) -> Any:
         """Values that are finite in all computations: within `FARTHEST` deviations of the mean."""
-        reach = FARTHEST * self.stack.scale
-        return np.clip(values, self.stack.mean - reach, self.stack.mean + reach)
+        mean, reach = self.stack.mean, FARTHEST * self.stack.scale
+        low, high = as_kind(mean - reach, values), as_kind(mean + reach, values)
+        return namespace(values).clip(values, low, high)
 
     def _limited(self, dataset: Dataset) -> Dataset:
         reach = FARTHEST * self.stack.scale

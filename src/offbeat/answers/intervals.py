@@ -7,10 +7,12 @@ times the fourth root of the local scale (Vovk et al., 2005; Lei et al., 2018, l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.baselines.simple import as_kind, channels_of
 from offbeat.baselines.weights import Errors, task_weights
 from offbeat.errors import InputError
 
@@ -35,15 +37,15 @@ class HalfWidths:
     table: Array
     count: Array
 
-    def at(self, key: NDArray[np.int64], unit: Array) -> Array:
+    def at(self, key: Any, unit: Any) -> Any:
         """(rows, channels, levels) half widths in original units.
 
         Args:
-            key: (rows, channels) kinds of values.
-            unit: (rows, channels) unit of their errors.
+            key: (rows, channels) kinds of values, an array or a tensor.
+            unit: (rows, channels) unit of their errors, likewise.
         """
-        channel = np.arange(key.shape[1])
-        return np.asarray(self.table[key, channel] * unit[..., None])
+        table = as_kind(self.table, unit)
+        return table[key, channels_of(unit)] * unit[..., None]
 
 
 def fit_half_widths(errors: Errors, predicted: Array, channels: int) -> HalfWidths:
@@ -108,21 +110,22 @@ def weighted_quantiles(values: Array, weight: Array, count: float) -> Array:
     return np.asarray(np.interp(levels, position, values))
 
 
-def half_width(widths: Array, level: float) -> Array:
+def half_width(widths: Array, level: float, levels: Array = LEVELS) -> Array:
     """The half width of an interval of any probability.
 
     Args:
-        widths: (..., levels) at `LEVELS`.
+        widths: (..., levels) at the levels.
         level: from 0 to 0.98.
+        levels: increasing.
 
     Raises:
         InputError: the level is out of that range.
     """
-    if not 0 < level <= LEVELS[-1]:
+    if not 0 < level <= levels[-1]:
         raise InputError(
-            f"the level of an interval must be above 0 and at most 0.98, got {level!r}"
+            f"the level of an interval must be above 0 and at most {levels[-1]:g}, got {level!r}"
         )
-    levels = np.concatenate([[0.0], LEVELS])
+    levels = np.concatenate([[0.0], levels])
     k = int(np.searchsorted(levels, level - 1e-12))
     low = widths[..., k - 2] if k > 1 else 0.0
     part = (level - levels[k - 1]) / (levels[k] - levels[k - 1])

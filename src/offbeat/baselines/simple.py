@@ -197,6 +197,25 @@ def as_kind(array: Array, like: Any) -> Any:
     return torch.as_tensor(array, dtype=like.dtype, device=like.device)
 
 
+def channels_of(like: Any) -> Any:
+    """(channels,) numbers of the channels, an index for tables.
+
+    Args:
+        like: (..., channels) array or tensor.
+    """
+    xp = namespace(like)
+    return xp.arange(like.shape[-1])
+
+
+def as_index(numbers: Any) -> Any:
+    """Whole numbers as an index for tables, int64.
+
+    Args:
+        numbers: array or tensor of floats.
+    """
+    return numbers.astype(np.int64) if isinstance(numbers, np.ndarray) else numbers.long()
+
+
 _SIMPLE: dict[str, type[Baseline]] = {
     "last_value": LastValue,
     "mean": Mean,

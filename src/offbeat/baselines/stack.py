@@ -24,7 +24,7 @@ from offbeat.baselines.base import (
 from offbeat.baselines.folds import cross_fitted
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.local_scale import LocalScale
-from offbeat.baselines.simple import as_kind
+from offbeat.baselines.simple import as_index, as_kind, channels_of
 from offbeat.baselines.weights import Errors, simplex_weights
 from offbeat.data.trajectory import Dataset
 
@@ -122,17 +122,18 @@ class Keys:
         """(keys,) s, upper end of the bin; infinite for the last kind."""
         return np.append(np.repeat(self.bins.edges, LEVELS), np.inf)
 
-    def unit(self, kind: Array) -> Array:
+    def unit(self, kind: Any) -> Any:
         """(...) typical size of an error, in original units.
 
         The usual error at that time since observation, times the fourth root of the local scale.
 
         Args:
-            kind: (..., channels, 4) of `read`.
+            kind: (..., channels, 4) of `read`, an array or a tensor.
         """
-        usual = np.sqrt(self.local.usual_at(kind[..., 2]))
-        unit = np.where(np.isinf(kind[..., 2]), self.local.slope.scale, usual)
-        return np.asarray(unit * kind[..., 1] ** 0.25)
+        xp, age = namespace(kind), kind[..., 2]
+        usual = xp.sqrt(self.local.usual_at(age))
+        unit = xp.where(xp.isinf(age), as_kind(self.local.slope.scale, kind), usual)
+        return unit * kind[..., 1] ** 0.25
 
     def cells(self, tasks: Dataset) -> Cells:
         """The known values of tasks."""
@@ -208,10 +209,8 @@ class Stack(CausalBaseline):
             key: (..., channels) kinds.
             last: (..., channels) last values: an answer may be as far out as they are.
         """
-        xp = namespace(key)
-        channel = np.arange(len(self.mean)) if xp is np else xp.arange(len(self.mean))
         weights = as_kind(self.weights, key)
-        at = key.astype(np.int64) if xp is np else key.long()
+        at, channel = as_index(key), channels_of(key)
         total = 0.0 * key
         for j, predicted in enumerate(each):
             total = total + weights[at, channel, j] * predicted

@@ -9,8 +9,9 @@ from offbeat.errors import one_of
 
 
 def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False) -> None:
-    """Export one streaming step of a model to ONNX, its state as inputs and outputs.
+    """Export one streaming step of a model or blend to ONNX, its state as inputs and outputs.
 
+    A run of offbeat train holds a blend, whose predictions have intervals.
     The file runs without torch: in offbeat.OnnxStream, offbeat stream FILE, or any ONNX runtime.
 
     Args:
@@ -22,12 +23,12 @@ def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False)
     one_of("export format", to, ("onnx",))
     one_of("suffix of out", out.suffix, (".onnx",))
 
+    from offbeat.answers.saved import load_run
     from offbeat.export.exporter import export_onnx
     from offbeat.files import writable
-    from offbeat.models.checkpoint import load_model
 
     writable(out)
-    loaded = load_model(model)
+    loaded = load_run(model)
     export_onnx(loaded, out)
     size = out.stat().st_size
     result = {"written": str(out), "model": loaded.name, "bytes": size}

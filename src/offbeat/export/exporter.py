@@ -6,8 +6,8 @@ import json
 import logging
 import math
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,81 +18,125 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from offbeat import kernels
+from offbeat.answers.blend import Blend
+from offbeat.answers.intervals import LEVELS
+from offbeat.baselines.base import CausalBaseline
 from offbeat.baselines.history import History
 from offbeat.data.batch import Batch
 from offbeat.errors import InputError, one_of, require
-from offbeat.export.runner import FORMAT, METADATA, STATE, VERSION, WITHOUT_BASE
+from offbeat.export.runner import FORMAT, METADATA, STATE, VERSION, WITH_BASE, WITHOUT_BASE
 from offbeat.files import atomic_path
+from offbeat.models.base import BaseModel
 from offbeat.models.corrected import CorrectedModel
 from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model
 from offbeat.ode import tableau
 from offbeat.stream.blend_engine import flat_state, like_state
+from offbeat.stream.stream import info_of
 
 
-def export_onnx(model: Model | CorrectedModel, path: str | Path) -> None:
+def export_onnx(model: BaseModel | Blend, path: str | Path) -> None:
     """Writes one streaming step of a model as an ONNX file, for `OnnxStream` or any ONNX runtime.
 
     Inputs: `t` (1,) float64, s, since any fixed origin; `values` (1, channels) float64 in original
     units, transformed, NaN where not measured; and the state. Outputs: `prediction` (1, channels)
-    float64 in original units, of a row at `t`, before its values are used; and the state after the
-    row, each part named as the input with `_next`. A prediction alone is the same step with all
-    values NaN, whose state is not used. The initial state, channel names, units and input
-    transforms are JSON in the metadata under `offbeat`.
+    float64 in original units, of a row at `t`, before its values are used; of a blend, the
+    `half_widths` (1, channels, levels) float64 of its intervals; and the state after the row, each
+    part named as the input with `_next`. A prediction alone is the same step with all values NaN,
+    whose state is not used. The initial state, channel names, units, input transforms and the
+    probabilities of the intervals are JSON in the metadata under `offbeat`.
 
     The graph is a trace of `model.forward` in the reference backend, for one row. The steps of the
     solver from node to node are a loop in it. Where the model corrects a baseline, the baseline and
-    its state are part of the graph.
+    its state are part of the graph; of a blend, all of its causal baselines, in float64.
 
     Args:
-        model: trained.
+        model: trained; a blend predicts from the past, as in `Stream`.
         path: .onnx file, written atomically.
 
     Raises:
         InputError: a model without a recurrent state or with actions; an adaptive solver, whose
-            number of steps is not known before; self-feeding, which draws random numbers; or
-            another suffix.
+            number of steps is not known before; self-feeding, which draws random numbers; a
+            baseline that does not run on torch tensors; or another suffix.
         MissingExtraError: onnx or onnxscript is not installed.
     """
     path = Path(path)
     one_of("suffix of an ONNX file", path.suffix, (".onnx",))
-    _check_exportable(model)
+    forward = model.forward if isinstance(model, Blend) else model
+    inner = None if forward is None else _exportable(forward)
     onnx = require("onnx", "export")
     optimizer: Any = require("onnxscript.optimizer", "export")
-    inner = model.inner if isinstance(model, CorrectedModel) else model
-    past = inner.empty_state(1)
-    initial = {name: getattr(past, name).detach().cpu().clone() for name in STATE}
-    step: nn.Module = StreamStep(inner)
-    if isinstance(model, CorrectedModel):
-        step = CorrectedStep(model)
-        initial |= step.initial()
-    inputs = (
-        torch.zeros(1, dtype=torch.float64),
-        torch.zeros((1, model.channels), dtype=torch.float64),
-        *initial.values(),
-    )
-    with torch.no_grad(), _quiet(), _traceable(inner):
-        program: Any = torch.onnx.export(
-            step.eval(),
-            inputs,
-            input_names=["t", "values", *initial],
-            output_names=["prediction", *(f"{name}_next" for name in initial)],
-            dynamo=True,
-            optimize=False,
-            verbose=False,
-        )
+    step = BlendStep(model) if isinstance(model, Blend) else _step_of(model)
+    with torch.no_grad(), _quiet(), nullcontext() if inner is None else _traceable(inner):
+        try:
+            program = _traced(step)
+        except Exception:
+            if isinstance(model, Blend):
+                _check_members(model)
+            raise
     # All but its rule for nested bounds, which can refer to a constant that it does not add.
     optimizer.fold_constants(program.model)
     optimizer.remove_unused_nodes(program.model)
     proto = program.model_proto
     entry = proto.metadata_props.add()
-    entry.key, entry.value = METADATA, json.dumps(_record(model, initial), allow_nan=False)
+    entry.key, entry.value = METADATA, json.dumps(_record(model, step.initial()), allow_nan=False)
     onnx.checker.check_model(proto)
     with atomic_path(path) as temporary:
         temporary.write_bytes(proto.SerializeToString())
 
 
-class StreamStep(nn.Module):
+def _traced(step: Step) -> Any:
+    """The ONNX program of a step."""
+    initial = step.initial()
+    inputs = (
+        torch.zeros(1, dtype=torch.float64),
+        torch.zeros((1, step.channels), dtype=torch.float64),
+        *initial.values(),
+    )
+    return torch.onnx.export(
+        step.eval(),
+        inputs,
+        input_names=["t", "values", *initial],
+        output_names=[*step.answers, *(f"{name}_next" for name in initial)],
+        dynamo=True,
+        optimize=False,
+        verbose=False,
+    )
+
+
+def _check_members(blend: Blend) -> None:
+    """Says which baseline of a blend cannot be exported."""
+    for name, member in blend.stack.members.items():
+        try:
+            _traced(BaselineStep(member, blend.channels))
+        except Exception as error:
+            what = " ".join(str(error.__cause__ or error).split())[:200]
+            raise InputError(
+                f"the baseline {name!r} of the blend cannot be exported ({what}); its methods must "
+                "run on torch tensors without branches on their values, or fit the blend without it"
+            ) from error
+
+
+class Step(nn.Module):
+    """One row of one trajectory, from and to original units; the state goes in and out flat.
+
+    Args:
+        channels: their number.
+    """
+
+    answers: tuple[str, ...] = ("prediction",)
+    """Names of the outputs before the next state."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.channels = channels
+
+    def initial(self) -> dict[str, Tensor]:
+        """The state before the first row, by the names of the inputs."""
+        raise NotImplementedError
+
+
+class StreamStep(Step):
     """`model.forward` for one row of one trajectory, from and to original units.
 
     Args:
@@ -103,10 +147,15 @@ class StreamStep(nn.Module):
     scale: Tensor
 
     def __init__(self, model: Model) -> None:
-        super().__init__()
+        super().__init__(model.channels)
         self.model = model
         self.register_buffer("shift", torch.tensor(model.scaler.shift)[None])
         self.register_buffer("scale", torch.tensor(model.scaler.scale)[None])
+
+    def initial(self) -> dict[str, Tensor]:
+        """See `Step`."""
+        past = self.model.empty_state(1)
+        return {name: getattr(past, name).detach().cpu().clone() for name in STATE}
 
     def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Prediction and next state.
@@ -130,7 +179,7 @@ class StreamStep(nn.Module):
             return prediction, *(getattr(output.past, name).clone() for name in STATE)
 
 
-class CorrectedStep(nn.Module):
+class CorrectedStep(Step):
     """The same for a model that corrects a baseline, whose state is further parts.
 
     Args:
@@ -138,26 +187,25 @@ class CorrectedStep(nn.Module):
     """
 
     def __init__(self, model: CorrectedModel) -> None:
-        super().__init__()
+        super().__init__(model.channels)
         self.model, self.history = model, History(1)
         self.inner = StreamStep(model.inner)
 
     def empty(self) -> dict[str, Any]:
         """The nested state of the baseline before the first row."""
-        zeros = np.zeros((1, self.model.channels))
+        zeros = np.zeros((1, self.channels))
         return {"base": self.model.base.start(zeros), "history": self.history.start(zeros)}
 
     def initial(self) -> dict[str, Tensor]:
-        """The same, flat, by the names of the inputs."""
-        return {k: torch.from_numpy(v.copy()) for k, v in flat_state(self.empty()).items()}
+        """See `Step`."""
+        return {**self.inner.initial(), **_tensors(self.empty())}
 
     def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Prediction and next state, as of `StreamStep`, and then those of the baseline."""
         model, own = self.model, state[len(STATE) :]
         mean, *after = self.inner(t, values, *state[: len(STATE)])
         with _ExactNumbers():
-            given: dict[str, Any] = dict(zip(flat_state(self.empty()), own, strict=True))
-            past = like_state(self.empty(), given)
+            past = _nested(self.empty(), own)
             shift, scale = self.inner.shift, self.inner.scale
             time = t[:, None]
             base = (model.base.read(past["base"], time) - shift) / scale
@@ -169,9 +217,109 @@ class CorrectedStep(nn.Module):
                 "base": model.base.observe(past["base"], *row),
                 "history": self.history.observe(past["history"], *row),
             }
-            named = dict(_named(then))
-            nexts = [named[name].double().clone() for name in given]
-            return joined * scale + shift, *after, *nexts
+            return joined * scale + shift, *after, *_next(self.empty(), then)
+
+
+class BaselineStep(Step):
+    """The same for a baseline alone.
+
+    Args:
+        baseline: fitted.
+        channels: their number.
+    """
+
+    def __init__(self, baseline: CausalBaseline, channels: int) -> None:
+        super().__init__(channels)
+        self.baseline = baseline
+
+    def empty(self) -> dict[str, Any]:
+        """The nested state before the first row."""
+        return {"stack": self.baseline.start(np.zeros((1, self.channels)))}
+
+    def initial(self) -> dict[str, Tensor]:
+        """See `Step`."""
+        return _tensors(self.empty())
+
+    def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """Prediction and next state, as of `StreamStep`."""
+        with _ExactNumbers():
+            past, time, mask = _nested(self.empty(), state)["stack"], t[:, None], _finite(values)
+            row = (time, torch.where(mask, values, torch.zeros_like(values)), mask)
+            then = {"stack": self.baseline.observe(past, *row)}
+            return self.baseline.read(past, time).clone(), *_next(self.empty(), then)
+
+
+class BlendStep(Step):
+    """The same for a blend, with intervals: its forward model, where it has one, and its stack.
+
+    Args:
+        blend: its forward model runs within `_traceable`.
+    """
+
+    answers = ("prediction", "half_widths")
+
+    def __init__(self, blend: Blend) -> None:
+        super().__init__(blend.channels)
+        self.blend = blend
+        self.stack = BaselineStep(blend.stack, blend.channels)
+        self.model = None if blend.forward is None else _step_of(blend.forward)
+
+    def initial(self) -> dict[str, Tensor]:
+        """See `Step`."""
+        model = {} if self.model is None else self.model.initial()
+        return {**model, **self.stack.initial()}
+
+    def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """Prediction, half widths at the levels of `intervals.LEVELS`, and next state.
+
+        Args:
+            t: (1,) float64, s.
+            values: (1, channels) float64, original units, NaN where not measured.
+            *state: of the model and then of the stack.
+        """
+        blend, model, after = self.blend, None, ()
+        own = state[len(state) - len(self.stack.initial()) :]
+        with _ExactNumbers():
+            unseen = torch.full_like(values, math.nan)
+            values = torch.where(_finite(values), blend.limited(values), unseen)
+        if self.model is not None:
+            model, *after = self.model(t, values, *state[: len(state) - len(own)])
+        base, *then = self.stack(t, values, *own)
+        with _ExactNumbers():
+            keys = _nested(self.stack.empty(), own)["stack"]["keys"]
+            kind = blend.stack.keys.read(keys, t[:, None])
+            prediction, _ = blend.corrected(base, model, kind)
+            return prediction.clone(), blend.half_widths(kind), *after, *then
+
+
+def _step_of(model: BaseModel) -> Step:
+    """The step of a model that `_exportable` accepts."""
+    if isinstance(model, CorrectedModel):
+        return CorrectedStep(model)
+    assert isinstance(model, Model)
+    return StreamStep(model)
+
+
+def _finite(values: Tensor) -> Tensor:
+    """Where a number is finite; NaN is not."""
+    return values.abs() < math.inf
+
+
+def _tensors(empty: dict[str, Any]) -> dict[str, Tensor]:
+    """Nested states of arrays as tensors, flat."""
+    return {name: torch.from_numpy(value.copy()) for name, value in flat_state(empty).items()}
+
+
+def _nested(empty: dict[str, Any], flat: Sequence[Tensor]) -> dict[str, Any]:
+    """Flat tensors as nested states like these."""
+    given: dict[str, Any] = dict(zip(flat_state(empty), flat, strict=True))
+    return like_state(empty, given)
+
+
+def _next(empty: dict[str, Any], then: dict[str, Any]) -> list[Tensor]:
+    """Nested states as flat tensors, in the order of these; no output is also an input."""
+    named = dict(_named(then))
+    return [named[name].double().clone() for name in flat_state(empty)]
 
 
 def _named(state: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Tensor]]:
@@ -198,12 +346,20 @@ class _ExactNumbers(TorchFunctionMode):
         if func is torch.add and "alpha" in kwargs:
             return args[0] + _exact(kwargs["alpha"]) * args[1]
         if any(isinstance(arg, Tensor) for arg in args):
-            args = tuple(_exact(arg) for arg in args)
+            # Where one bound of a clip is a tensor, the other one must be, too.
+            convert = _as_tensor if func in (torch.clip, torch.clamp) else _exact
+            args = tuple(map(convert, args))
         return func(*args, **kwargs)
 
 
 def _exact(value: Any) -> Any:
     if type(value) is float and math.isfinite(value) and float(np.float32(value)) != value:
+        return torch.tensor(value, dtype=torch.float64)
+    return value
+
+
+def _as_tensor(value: Any) -> Any:
+    if isinstance(value, float | int):
         return torch.tensor(value, dtype=torch.float64)
     return value
 
@@ -234,31 +390,32 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _record(model: Model | CorrectedModel, initial: dict[str, Tensor]) -> dict[str, Any]:
+def _record(model: BaseModel | Blend, initial: dict[str, Tensor]) -> dict[str, Any]:
     """The metadata that a stream needs besides the graph."""
-    inner = model.inner if isinstance(model, CorrectedModel) else model
-    limit = float(inner.config.gap_limit or 1)
+    info, blend = info_of(model), isinstance(model, Blend)
     further = {name: value.tolist() for name, value in initial.items() if name not in STATE}
-    finite = {  # JSON has no infinities: the runner sets the other initial values
-        name: initial[name].tolist() for name in ("state", "last")
-    }
+    # JSON has no infinities: the runner sets the other initial values.
+    finite = {name: initial[name] for name in ("state", "last") if name in initial}
+    dtypes = {str(value.dtype).removeprefix("torch.") for value in finite.values()}
     return {
         "format": FORMAT,
-        "version": VERSION if further else WITHOUT_BASE,
+        "version": VERSION if blend else WITH_BASE if further else WITHOUT_BASE,
         "model": model.name,
-        "names": list(model.names),
-        "units": list(model.units),
-        "roles": list(model.roles),
-        "median_gap_s": model.statistics.median_gap,
-        "elapsed_limit_s": model.statistics.longest_elapsed * limit,
-        "transforms": model.transforms.to_dict(),
-        "dtype": str(model.dtype).removeprefix("torch."),
-        "initial": finite,
+        "names": list(info.names),
+        "units": list(info.units),
+        "roles": list(info.roles),
+        "median_gap_s": info.median_gap,
+        "elapsed_limit_s": info.elapsed_limit,
+        "transforms": info.transforms.to_dict(),
+        "dtype": dtypes.pop() if dtypes else "float64",
+        "initial": {name: value.tolist() for name, value in finite.items()},
         **({"base": further} if further else {}),
+        **({"levels": LEVELS.tolist()} if blend else {}),
     }
 
 
-def _check_exportable(model: Model | CorrectedModel) -> None:
+def _exportable(model: BaseModel) -> Model:
+    """The model itself, or the one that corrects a baseline, if a graph can hold its step."""
     model = model.inner if isinstance(model, CorrectedModel) else model
     if not isinstance(model, Model):
         raise InputError(
@@ -272,11 +429,10 @@ def _check_exportable(model: Model | CorrectedModel) -> None:
             "a model with self_feeding draws random numbers at every row, which a graph cannot; "
             "train one without self_feeding to export it"
         )
-    if not model.spec.field:
-        return
-    if tableau(model.spec.solver).adaptive:
+    if model.spec.field and tableau(model.spec.solver).adaptive:
         raise InputError(
             f"the solver {model.spec.solver!r} chooses its steps by their errors, which an ONNX "
             "graph cannot; train or load the model with a solver of fixed "
             "steps (euler, midpoint, heun, rk4), or stream it with offbeat.Stream"
         )
+    return model

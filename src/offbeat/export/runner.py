@@ -18,22 +18,25 @@ from offbeat.stream.live import LiveStream, StreamInfo
 from offbeat.stream.options import StreamOptions, with_options
 
 FORMAT = "offbeat-step"
-VERSION = 3
+VERSION = 4
+WITH_BASE = 3
 WITHOUT_BASE = 2
-"""Version of a file of a model that corrects no baseline; version 3 has the state of one."""
+"""Versions: 4 of a blend, 3 of a model that corrects a baseline, 2 of one that corrects none."""
 
 METADATA = "offbeat"
 """Key of a JSON object in the metadata of the file."""
 
 STATE = ("state", "time", "start", "observed_at", "channel_at", "last", "updated")
-"""Inputs that are the state; each has an output of its name with `_next`."""
+"""Inputs that are the state of a model; each has an output of its name with `_next`."""
 
 _NONE: dict[str, Any] = {"angles": {}, "quaternions": []}  # version 1 had no transforms
 _BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at": -np.inf}
 
 
 class OnnxStream(LiveStream):
-    """Runs a model that `export_onnx` wrote on messages as they arrive, without torch.
+    """Runs a model or blend that `export_onnx` wrote on messages as they arrive, without torch.
+
+    Predictions of a blend have intervals, as in `Stream`.
 
     Args:
         path: the .onnx file.
@@ -89,6 +92,7 @@ class OnnxEngine(Engine):
             session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
             record = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
             self.info, self._initial = _read(record)
+            self._levels = np.array(record.get("levels", []), dtype=np.float64)
         except FileFormatError:
             raise
         except Exception as error:  # onnxruntime has an exception for each kind of error
@@ -128,6 +132,17 @@ class OnnxEngine(Engine):
         each = [self._session.run(["prediction"], {"t": t[None], **feed})[0] for t in times]
         return np.concatenate(each)
 
+    def half_widths(self, times: NDArray[np.float64], level: float) -> NDArray[np.float64] | None:
+        """Half widths of intervals at each time, where the file is of a blend."""
+        if not len(self._levels):
+            return None
+        from offbeat.answers.intervals import half_width
+
+        feed = {"values": self._unmeasured, **self._state}
+        each = [self._session.run(["half_widths"], {"t": t[None], **feed})[0] for t in times]
+        table = np.array(each).reshape(len(times), len(self.info.names), len(self._levels))
+        return half_width(table, level, self._levels)
+
     def save(self, slot: int) -> None:
         """Keeps a reference to the state."""
         self._slots[slot] = self._state
@@ -157,14 +172,13 @@ def _read(record: Any) -> tuple[StreamInfo, Arrays]:
             f"Offbeat runs {FORMAT!r} of versions 1 to {VERSION}; export the model again"
         )
     names = tuple(record["names"])
-    dtype = np.dtype(record["dtype"])
-    initial: Arrays = {
-        name: np.array(values, dtype=dtype) for name, values in record["initial"].items()
-    }
-    shapes = {"channel_at": (1, len(names))}
-    for name, value in _BEGINS.items():
-        initial[name] = np.full(shapes.get(name, (1,)), value)
-    initial["updated"] = np.zeros(1, dtype=bool)
+    initial: Arrays = {}
+    if record["initial"]:  # a blend may be of baselines alone
+        dtype, shapes = np.dtype(record["dtype"]), {"channel_at": (1, len(names))}
+        given = {name: np.array(v, dtype=dtype) for name, v in record["initial"].items()}
+        begins = {name: np.full(shapes.get(name, (1,)), v) for name, v in _BEGINS.items()}
+        every = {**given, **begins, "updated": np.zeros(1, dtype=bool)}
+        initial = {name: every[name] for name in STATE}
     info = StreamInfo(
         names=names,
         units=tuple(record["units"]),
@@ -175,4 +189,4 @@ def _read(record: Any) -> tuple[StreamInfo, Arrays]:
         roles=tuple(record.get("roles", ())),
     )
     base = {name: np.array(v, dtype=np.float64) for name, v in record.get("base", {}).items()}
-    return info, {**{name: initial[name] for name in STATE}, **base}
+    return info, {**initial, **base}

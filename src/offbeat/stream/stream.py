@@ -58,50 +58,45 @@ class Stream(LiveStream):
         seed: int = 0,
         **fields: Any,
     ) -> None:
-        chosen = with_options(options, fields)
+        chosen, seed = with_options(options, fields), check_seed(seed)
+        forward = model.forward if isinstance(model, Blend) else model
+        engine: Engine | None = None
+        if forward is not None:
+            window = chosen.window_rows or forward.statistics.rows or 1
+            engine = engine_of(forward, seed=seed, window=window)
         if isinstance(model, Blend):
-            info, engine = of_blend(model, seed=check_seed(seed), window=chosen.window_rows)
-            super().__init__(engine, info, options=chosen, time_unit=time_unit)
-            return
-        inner = model.inner if isinstance(model, CorrectedModel) else model
-        limit = float(inner.config.gap_limit or 1) if isinstance(inner, Model) else 1.0
-        info = StreamInfo(
-            names=model.names,
-            units=model.units,
-            scaler=model.scaler,
-            median_gap=model.statistics.median_gap,
-            elapsed_limit=model.statistics.longest_elapsed * limit,
-            transforms=model.transforms,
-            roles=model.roles,
-        )
-        window = chosen.window_rows or model.statistics.rows or 1
-        engine = engine_of(model, seed=check_seed(seed), window=window)
-        super().__init__(engine, info, options=chosen, time_unit=time_unit)
+            engine = BlendEngine(model, engine)
+        assert engine is not None
+        super().__init__(engine, info_of(model), options=chosen, time_unit=time_unit)
 
 
-def of_blend(blend: Blend, *, seed: int, window: int | None) -> tuple[StreamInfo, Engine]:
-    """What a stream needs of a blend, and the engine that runs it.
+def info_of(model: BaseModel | Blend) -> StreamInfo:
+    """What a stream needs of a model or a blend besides an engine.
 
     Args:
-        blend: fitted.
-        seed: of the generator of self-feeding.
-        window: rows that a model without a recurrent state is run on; None for those of training.
+        model: trained, or fitted.
     """
-    model, inner = blend.forward, None
-    gap, limit = blend.tasks.gap_s, 4.0 * float(blend.stack.keys.bins.edges[-1])
-    if model is not None:
-        inner = engine_of(model, seed=seed, window=window or model.statistics.rows or 1)
-        gap = model.statistics.median_gap
-    info = StreamInfo(
-        names=blend.names,
-        units=blend.units,
-        scaler=Scaler.identity(blend.channels),
+    scaler: Scaler
+    if isinstance(model, Blend):
+        forward = model.forward
+        gap = model.tasks.gap_s if forward is None else forward.statistics.median_gap
+        limit = 4.0 * float(model.stack.keys.bins.edges[-1])
+        scaler = Scaler.identity(model.channels)
+    else:
+        inner = model.inner if isinstance(model, CorrectedModel) else model
+        gap, scaler = model.statistics.median_gap, model.scaler
+        limit = model.statistics.longest_elapsed
+        if isinstance(inner, Model):
+            limit *= float(inner.config.gap_limit or 1)
+    return StreamInfo(
+        names=model.names,
+        units=model.units,
+        scaler=scaler,
         median_gap=gap,
         elapsed_limit=limit,
-        transforms=blend.transforms,
-        roles=blend.roles,
+        transforms=model.transforms,
+        roles=model.roles,
     )
-    return info, BlendEngine(blend, inner)
 
 
 def engine_of(model: BaseModel, *, seed: int, window: int) -> Engine:
