@@ -76,7 +76,6 @@ def info_of(model: BaseModel | Blend) -> StreamInfo:
     Args:
         model: trained, or fitted.
     """
-    scaler: Scaler
     if isinstance(model, Blend):
         forward = model.forward
         gap = model.tasks.gap_s if forward is None else forward.statistics.median_gap
