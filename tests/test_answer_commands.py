@@ -23,7 +23,12 @@ PARTS = [
     "--split.by=time", "--split.window_s=0.4", "--split.mask=bursts",
     "--split.burst_s=0.05", "--split.observed_fraction=0.7",
 ]  # fmt: skip
-MODEL = ["--model.hidden_size=4", "--model.field_units=[6]", "--training.epochs=1"]
+MODEL = [
+    "--baselines=[last_value,constant_velocity,linear,pchip]",
+    "--model.hidden_size=4",
+    "--model.field_units=[6]",
+    "--training.epochs=1",
+]
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -281,7 +282,7 @@ def test_predict_answers_at_asked_times_in_original_units(run, data, tmp_path):
         lines = list(csv.DictReader(file))
     assert len(lines) == 24 * 2
     assert [float(line["time"]) for line in lines[:2]] == [0.1, 0.2]
-    expected = ob.predict(ob.load_model(run), ob.load(data), times=[0.1, 0.2])
+    expected = ob.predict(ob.load_run(run), ob.load(data), times=[0.1, 0.2])
     assert (
         float(lines[1]["waist_qpos"]) == expected[0].values[1, expected.names.index("waist_qpos")]
     )
@@ -299,7 +300,8 @@ def test_predict_reads_a_csv_with_empty_values_and_columns_in_another_order(run,
     import pyarrow.parquet as pq
 
     table = pq.read_table(out)
-    assert table.column_names == ["trajectory", "time", *names]
+    assert table.column_names[:16] == ["trajectory", "time", *names]
+    assert {f"{name}|low" for name in names} < set(table.column_names)
     assert np.isfinite(table["knee_qvel"].to_numpy()).all()
 
 
@@ -336,7 +338,9 @@ def test_predict_takes_times_since_the_first_row_or_on_the_clock(run, stamped, t
     since, shown = answers
     assert (since.pop("time"), since.pop("clock_s")) == ("0.01", "100.01")
     assert shown.pop("time") == "100.01"
-    assert since == pytest.approx(shown)
+    assert since.keys() == shown.keys()
+    numbers = [name for name, value in since.items() if value not in ("true", "false")]
+    assert [float(since[n]) for n in numbers] == pytest.approx([float(shown[n]) for n in numbers])
     error = one_line_error(capsys, "predict", run, stamped, out, named, "--times=[0.01, 100.01]")
     assert all(said in error for said in ("100.01", "0.015", "give 0.01", "--reader.start clock"))
     assert main(["predict", str(run), str(stamped), str(out), named, "--times=150"]) == 0
@@ -535,7 +539,8 @@ def test_a_training_without_options_follows_the_recipe_and_beats_the_last_value(
     assert rmse["anchored_ode_gru_d"] < 0.8 * rmse["last_value"]
     config = yaml.safe_load((run / "config.yaml").read_text())["training"]
     recipe = ob.train_config("anchored_ode_gru_d", keep="best")
-    assert ob.TrainConfig(**config) == recipe
+    expected = {k: v for k, v in asdict(recipe).items() if v is not None}
+    assert expected.items() <= config.items()
     assert config["optimizer"] == "adam"
 
 

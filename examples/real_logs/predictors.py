@@ -154,6 +154,7 @@ def offbeat(log: Log, seed: int, quick: bool) -> Mapping[str, Predictor]:
         quick: two epochs of one model, for tests.
     """
     options: dict[str, Any] = {"as_it_is": bool(log.masked), "seed": seed, "progress": False}
+    options["baselines"] = [name for name, kind in BASELINES.items() if not kind.slow]
     if quick:
         options |= {"model": MODEL, "training": ob.TrainConfig(epochs=2, seed=seed)}
         if not log.masked:

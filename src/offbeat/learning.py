@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from offbeat.answers.backward import fit_backward
-from offbeat.answers.blend import Blend, fit_blend
+from offbeat.answers.blend import Blend, by_direction, fit_blend
 from offbeat.answers.saved import BACKWARD, save_blend
 from offbeat.baselines.history import typical_gap
 from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig, check_seed
@@ -23,6 +24,9 @@ from offbeat.training import FitResult, fit
 
 BUDGET_S = 240.0
 """s, default time for the trainings of a log, on one thread."""
+
+SIMPLE = ("last_value", "mean", "constant_velocity", "damped_slope", "linear", "pchip")
+"""Baselines of the blend of a data set as it is: those that are fitted at once."""
 
 _FORWARD_SHARE = 0.7
 """Part of the budget for the ladder and the forward model; the rest is for the backward one."""
@@ -64,6 +68,7 @@ def learn(
     chosen: Plan | None = None,
     as_it_is: bool = False,
     two_sided: bool = True,
+    baselines: Sequence[str] | None = None,
     scaler: ScalerKind | Scaler | None = None,
     budget_s: float = BUDGET_S,
     seed: int = 0,
@@ -87,6 +92,8 @@ def learn(
         as_it_is: train on the windows and masks of `split`, instead of tasks that are drawn anew in
             each epoch: for a data set that has masks of its own.
         two_sided: train a backward model, for fills from both sides.
+        baselines: names of those in the blend; by default all that are not slow, and `SIMPLE` ones
+            for a data set as it is.
         scaler: of the models; by default robust, and standardise for a data set as it is.
         budget_s: s, time for the trainings on one thread of this machine, about. The number of
             epochs follows from it and from the time of a step; a model that is given is trained by
@@ -135,6 +142,7 @@ def learn(
         training=training,
         as_it_is=as_it_is,
         two_sided=two_sided,
+        baselines=baselines,
         scaler=scaler,
         budget_s=budget_s,
         seed=seed,
@@ -155,6 +163,7 @@ def train_blend(
     training: TrainConfig | None = None,
     as_it_is: bool = False,
     two_sided: bool = True,
+    baselines: Sequence[str] | None = None,
     scaler: ScalerKind | Scaler | None = None,
     budget_s: float = BUDGET_S,
     seed: int = 0,
@@ -172,6 +181,7 @@ def train_blend(
         training: options that differ from the recipe.
         as_it_is: train on the trajectories and masks as they are.
         two_sided: train a backward model.
+        baselines: names of those in the blend.
         scaler: of the models.
         budget_s: s, for the trainings.
         seed: of weights and tasks.
@@ -223,6 +233,8 @@ def train_blend(
             **common,
         )
     masked = any(masked_values(t).any() for t in train)
+    names = SIMPLE if baselines is None and as_it_is else baselines
+    members: dict[str, Any] = {} if names is None else by_direction(names)
     blend = fit_blend(
         train,
         validation,
@@ -231,6 +243,7 @@ def train_blend(
         tasks=tasks,
         masks_of_data=as_it_is and masked,
         seed=seed,
+        **members,
     )
     if folder is not None:
         save_blend(blend, folder)

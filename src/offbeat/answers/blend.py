@@ -372,6 +372,21 @@ def fit_blend(
     )
 
 
+def by_direction(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Baselines as the arguments `causal` and `two_sided` of `fit_blend`.
+
+    Args:
+        names: of baselines; `last_value` is added where no causal one, and `linear` where none that
+            uses both sides is among them.
+
+    Raises:
+        InputError: there is no baseline of a name.
+    """
+    causal = tuple(name for name in names if BASELINES[name].causal) or ("last_value",)
+    both = tuple(name for name in names if not BASELINES[name].causal) or ("linear",)
+    return {"causal": causal, "two_sided": both}
+
+
 def number_of_tasks(part: Dataset, config: TaskConfig, most: int) -> int:
     """Tasks that cover a part about four times, from 100 to `most`; fewer of very large ones.
 

@@ -18,7 +18,7 @@ from scipy.optimize import nnls
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-POOLED = 4.0
+POOLED = 10.0
 """Tasks of all channels together that count beside those of a channel."""
 
 WORST = 4.0

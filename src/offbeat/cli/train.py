@@ -24,6 +24,7 @@ def train_command(
     split: SplitConfig = SplitConfig(),  # noqa: B008
     scaler: str | None = None,
     two_sided: bool | None = None,
+    baselines: list[str] | None = None,
     budget_minutes: float = 4.0,
     reader: dict[str, Any] | None = None,
     seed: int = 0,
@@ -51,6 +52,9 @@ def train_command(
             part. By default robust, and standardise for a data set in the format of Offbeat.
         two_sided: train a second model on reversed trajectories as well, for fills from both
             sides, in the folder backward of the run. By default for logs.
+        baselines: names of the simple predictors that answers are blended with, such as
+            [last_value,ridge,pchip]; by default all for logs, and those that are fitted at once
+            for a data set of Offbeat.
         budget_minutes: time for the trainings, about, where the model is chosen.
         reader: how the log is read; the run keeps these options for the other commands.
         seed: of the initial weights.
@@ -105,6 +109,7 @@ def train_command(
         chosen=chosen,
         as_it_is=as_it_is,
         two_sided=not as_it_is if two_sided is None else two_sided,
+        baselines=baselines,
         scaler=scaler,  # type: ignore[arg-type]
         budget_s=60 * budget_minutes,
         seed=seed,
@@ -123,6 +128,7 @@ def train_command(
         "scaler": made.scaler.kind,
         "horizon_s": blend.tasks.horizon_s,
         "two_sided": blend.backward is not None,
+        "baselines": [*blend.stack.members, *blend.both.members],
         "reader": reader,
         "seed": seed,
         "threads": threads,
