@@ -24,6 +24,9 @@ from .logs import Log
 
 Array = NDArray[np.float64]
 MODEL = "anchored_ode_gru_d"
+BUDGET_S = 60.0
+"""s, for the trainings of a log, on one thread."""
+
 
 UNFITTED = ("last_value", "mean", "constant_velocity", "linear", "pchip")
 """Baselines that have nothing but the training mean; they are run once, not once per seed."""
@@ -154,6 +157,7 @@ def offbeat(log: Log, seed: int, quick: bool) -> Mapping[str, Predictor]:
         quick: two epochs of one model, for tests.
     """
     options: dict[str, Any] = {"as_it_is": bool(log.masked), "seed": seed, "progress": False}
+    options["budget_s"] = BUDGET_S
     options["baselines"] = [name for name, kind in BASELINES.items() if not kind.slow]
     if quick:
         options |= {"model": MODEL, "training": ob.TrainConfig(epochs=2, seed=seed)}
