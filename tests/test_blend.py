@@ -12,7 +12,14 @@ from offbeat.answers.blend import fit_blend, tables_of
 from offbeat.answers.both_sides import Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
 from offbeat.baselines.history import AgeBins
-from offbeat.baselines.weights import Errors, gate, on_simplex, simplex_weights, task_weights
+from offbeat.baselines.weights import (
+    Errors,
+    as_if_refitted,
+    gate,
+    on_simplex,
+    simplex_weights,
+    task_weights,
+)
 from offbeat.data.masking import masked_values
 from offbeat.data.tasks import TaskConfig, draw_tasks
 
@@ -330,3 +337,29 @@ def test_a_wild_value_leaves_no_trace_that_grows(with_models):
     for row in range(150):
         stream.observe(t.times[row], t.values[row] if row != 20 else [1e30, -1e30, 1e200])
     assert np.abs(stream.predict(t.times[150])[:2] - t.values[150, :2]).max() < 1.0
+
+
+def test_a_motion_that_leaves_the_range_of_training_is_followed():
+    """A heading that turns at a constant rate: unwrapped, it grows without end."""
+
+    def turning(start: float) -> ob.Dataset:
+        times = 0.02 * np.arange(400)
+        return ob.Dataset((ob.Trajectory(times, (start + 2.0 * times)[:, None]),))
+
+    members = {"causal": ["last_value", "constant_velocity"], "two_sided": ["linear"]}
+    config = TaskConfig(horizon_s=0.5, gap_s=0.02)
+    blend = fit_blend(turning(0.0), turning(1.0), tasks=config, **members)
+    later = turning(100.0)
+    ahead = ob.forecast(blend, later, 0.4)[0]
+    assert ahead.values[0, 0] == pytest.approx(later[0].values[-1, 0] + 0.8, abs=0.05)
+
+
+def test_cross_validated_errors_are_made_as_small_as_those_of_the_final_fit():
+    random = np.random.default_rng(0)
+    truth = random.normal(size=4000)
+    noise = random.normal(size=(4000, 2))
+    cross = errors_from(truth, truth[:, None] + noise * [1.0, 2.0])
+    other = errors_from(truth, truth[:, None] + noise[::-1] * [1.0, 1.0])
+    better = as_if_refitted(cross, other, np.array([False, True]), 1)
+    missed = better.predictions - truth[:, None]
+    assert missed.std(axis=0) == pytest.approx([1.0, 1.0], rel=0.05)

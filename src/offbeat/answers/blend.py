@@ -368,7 +368,10 @@ def fit_blend(
         for part in drawn(both, 1)
     ]
     return replace(
-        blend, both=fit_both_sides(two_sided, sides[0], sides[1], span_s=span, gap_s=gap)
+        blend,
+        both=fit_both_sides(
+            two_sided, sides[0], sides[1], span_s=span, validation_span_s=validation_span, gap_s=gap
+        ),
     )
 
 

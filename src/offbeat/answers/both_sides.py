@@ -33,7 +33,7 @@ from offbeat.baselines.stack import (
     joined,
     members_of,
 )
-from offbeat.baselines.weights import Errors, gate, simplex_weights
+from offbeat.baselines.weights import Errors, as_if_refitted, gate, simplex_weights
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 
@@ -233,6 +233,7 @@ def fit_both_sides(
     validation: Filled,
     *,
     span_s: float,
+    validation_span_s: float,
     gap_s: float,
 ) -> BothSides:
     """Fits weights to training and validation tasks, gamma and intervals to validation tasks.
@@ -242,6 +243,7 @@ def fit_both_sides(
         train: tasks of the training data.
         validation: tasks of other data.
         span_s: s, length of all the data.
+        validation_span_s: s, length of the validation data.
         gap_s: s, its typical gap.
     """
     channels = train.tasks.channels
@@ -264,9 +266,12 @@ def fit_both_sides(
         _errors(part.tasks, keys, units, reference, [*p, list(part.causal)], part.models, count)
         for part, p in ((train, predicted), (validation, later))
     ]
-    first = simplex_weights(flat[0][0], channels)
-    weights = simplex_weights(joined([flat[0][0], flat[1][0]]), channels)
+    bends = np.array([*(member.flexible for member in fitted.values()), False])
+    cross = as_if_refitted(flat[0][0], flat[1][0], bends, channels)
+    first = simplex_weights(cross, channels)
+    weights = simplex_weights(joined([cross, flat[1][0]]), channels)
     errors, models = flat[1]
+    errors = replace(errors, count=independent_tasks(keys.lengths(), validation_span_s, gap_s))
     held_out = (first[errors.key, errors.channel] * errors.predictions).sum(axis=1)
     base = (weights[errors.key, errors.channel] * errors.predictions).sum(axis=1)
     gamma, answer = gated(errors, held_out, base, models, channels)

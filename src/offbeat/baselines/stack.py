@@ -25,7 +25,7 @@ from offbeat.baselines.folds import cross_fitted
 from offbeat.baselines.history import AgeBins, History
 from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.simple import as_index, as_kind, channels_of
-from offbeat.baselines.weights import Errors, simplex_weights
+from offbeat.baselines.weights import Errors, as_if_refitted, simplex_weights
 from offbeat.data.trajectory import Dataset
 
 ACTIVITY = (-1.5, -0.5)
@@ -172,6 +172,7 @@ class Stack(CausalBaseline):
         weights: (keys, channels, members).
         low: (channels,) lowest answer.
         high: (channels,) highest answer.
+        reach: (channels,) farthest that an answer outside this range is from the last value.
     """
 
     flexible = True
@@ -181,6 +182,7 @@ class Stack(CausalBaseline):
     weights: Array
     low: Array
     high: Array
+    reach: Array
 
     def start(self, like: Any) -> State:
         """See `CausalBaseline`."""
@@ -217,10 +219,11 @@ class Stack(CausalBaseline):
         return self.bounded(total, last)
 
     def bounded(self, value: Any, last: Any) -> Any:
-        """A value within the range of answers, or between it and the last value."""
+        """A value within the range of answers, or as near to the last value as any move was."""
         xp = namespace(value)
-        low = xp.minimum(as_kind(self.low, value) + 0.0 * last, last)
-        high = xp.maximum(as_kind(self.high, value) + 0.0 * last, last)
+        reach = as_kind(self.reach, value)
+        low = xp.minimum(as_kind(self.low, value) + 0.0 * last, last - reach)
+        high = xp.maximum(as_kind(self.high, value) + 0.0 * last, last + reach)
         return xp.minimum(xp.maximum(value, low), high)
 
     def predict(self, dataset: Dataset) -> list[Array]:
@@ -247,6 +250,7 @@ class Stack(CausalBaseline):
             "weights": self.weights,
             "low": self.low,
             "high": self.high,
+            "reach": self.reach,
             "edges": self.keys.bins.edges,
         }
         nested = {f"local.{k}": v for k, v in self.keys.local.arrays().items()}
@@ -346,6 +350,11 @@ def fit_stack(
         errors_of(c, p, count, stack.keys.groups)
         for c, p in zip(cells, (predicted, later), strict=True)
     ]
+    moves = np.where(np.isinf(stack.keys.ages())[cells[0].key], 0.0, cells[0].truth - cells[0].last)
+    stack.reach = np.zeros(train.channels)
+    np.maximum.at(stack.reach, cells[0].channel, np.abs(moves))
+    flexible = np.array([member.flexible for member in stack.members.values()])
+    errors[0] = as_if_refitted(errors[0], errors[1], flexible, train.channels)
     stack.weights = simplex_weights(errors[0], train.channels)
     held_out = stack.mix(later, validation)
     stack.weights = simplex_weights(joined(errors), train.channels)
