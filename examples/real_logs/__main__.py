@@ -30,10 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--again", action="store_true", help="also what is in the results already")
     parser.add_argument("--quick", action="store_true", help="a small part, for tests")
     parser.add_argument("--document", type=Path, help="Markdown file whose tables are written")
+    parser.add_argument("--readme", type=Path, help="Markdown file whose first table is written")
     parser.add_argument("--figures", type=Path, help="folder of figures; without it, none is drawn")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    missing = []
+    missing, front = [], []
     for name in options.log or LOGS:
         try:
             log = LOGS[name](options.quick)
@@ -53,12 +54,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         files = [path_of(options.out, name, seed, options.quick) for seed in range(options.seeds)]
         summary = Summary(files)
         body = report.tables(summary)
+        if "offbeat" in summary.predictors and len(summary.tasks(summary.tests[0])) > 1:
+            front.append(summary)
         print(f"\n{log.title}\n\n{body}\n")
         every = f"# {log.title}\n\n{report.tables(summary, every=True)}\n"
         (files[0].parent / f"{'quick_' if options.quick else ''}tables.md").write_text(every)
         if options.document:
             text = options.document.read_text(encoding="utf-8")
             options.document.write_text(report.document(text, name, body), encoding="utf-8")
+    if options.readme and front:
+        text = options.readme.read_text(encoding="utf-8")
+        page = report.document(text, "real logs", report.front_page(front))
+        options.readme.write_text(page, encoding="utf-8")
     if missing:
         raise SystemExit("\n".join(missing))
 

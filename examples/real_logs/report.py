@@ -32,6 +32,39 @@ def document(text: str, name: str, body: str) -> str:
     return f"{before}{start}\n\n{body.strip()}\n\n{end}{after}"
 
 
+BY_HAND = {
+    "forecast 0.1 s": ("last_value", "constant_velocity"),
+    "forecast 0.5 s": ("last_value", "constant_velocity"),
+    "fill 0.5 s": ("linear", "pchip"),
+}
+"""Tasks of the front page, and what an engineer would do by hand; the better one is shown."""
+
+
+def front_page(summaries: Sequence[Summary]) -> str:
+    """A row per test part: what is done by hand, and Offbeat, RMSE in scaled units.
+
+    Args:
+        summaries: of the logs that have results of Offbeat.
+    """
+    head = ["log"]
+    for task in BY_HAND:
+        head += [f"{task}: by hand", "Offbeat"]
+    rows = []
+    for summary in summaries:
+        for test in summary.tests:
+            title = summary.head["title"].split(":")[0]
+            row = [title + (f", {test}" if len(summary.tests) > 1 else "")]
+            for task, simple in BY_HAND.items():
+                own = "offbeat_two_sided" if task.startswith("fill") else "offbeat"
+                errors = {n: _mean(summary.scaled(test, task, n)) for n in simple}
+                best = min(errors, key=lambda name: errors[name])
+                ours = _mean(summary.scaled(test, task, own))
+                bold = "**" if ours < errors[best] else ""
+                row += [f"{errors[best]:.3g} ({_label(summary, best)})", f"{bold}{ours:.3g}{bold}"]
+            rows.append(row)
+    return _table(head, rows)
+
+
 def tables(summary: Summary, *, every: bool = False) -> str:
     """The tables of a log: errors, comparisons and intervals of each test part.
 
