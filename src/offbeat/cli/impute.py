@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +58,18 @@ def impute_command(
     from offbeat.answers.saved import load_run
     from offbeat.cli.scored import fill_figure
     from offbeat.data.writers.tables import write_table
+    from offbeat.models.base import BaseModel
 
     check_out(out, data)
     check_figure(figure)
     check_seed(seed)
     loaded = load_run(model)
+    if (model / "two_sided.json").is_file() and isinstance(loaded, BaseModel):
+        print(
+            f"offbeat: note: {model} is a two-sided run of an earlier version, whose rule is not "
+            "read any more: values are filled from the past alone; train again for both sides",
+            file=sys.stderr,
+        )
     if rate_hz is not None and "max_gap_s" in known_options(data, reader, run=model):
         reader = {"max_gap_s": None, **(reader or {})}
     dataset = read_log(data, reader, run=model)
