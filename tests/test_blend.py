@@ -100,6 +100,17 @@ def test_gamma_is_the_least_squares_factor():
     assert gate(few, base[:3], said[:3], 1)[0, 0] < 0.4
 
 
+def test_gamma_of_a_channel_that_is_well_predicted_does_not_come_from_another_one():
+    random = np.random.default_rng(0)
+    said = random.normal(0, 1, (2, 6))
+    truth = np.stack([said[0], 1e-3 * random.normal(0, 1, 6)])  # the model is right, and wrong
+    channel = np.repeat([0, 1], 6)
+    errors = errors_from(truth.ravel(), np.zeros((12, 1)), channel=channel)
+    gamma = gate(errors, np.zeros(12), said.ravel(), 2)[0]
+    assert gamma[0] > 0.7
+    assert gamma[1] < 3e-3
+
+
 def test_half_widths_are_quantiles_of_absolute_errors():
     random = np.random.default_rng(0)
     truth = random.normal(0, 1, 50000)

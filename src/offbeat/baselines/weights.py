@@ -277,7 +277,10 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     top = cross + POOLED * pooled * typical
     below = square + (POOLED + CAUTION) * typical
     gamma = np.where(effective > 0, top / np.maximum(below, 1e-300), 0.0)
-    return np.asarray(np.clip(gamma, 0.0, 1.0))
+    # No least-squares factor is larger (Cauchy and Schwarz): where the model moves much further
+    # than the base is wrong, what it says in other channels does not count.
+    largest = np.sqrt(least / np.maximum(square, 1e-300))
+    return np.asarray(np.clip(np.minimum(gamma, largest), 0.0, 1.0))
 
 
 def _robust(missed: Array) -> Array:
