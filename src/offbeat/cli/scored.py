@@ -194,8 +194,14 @@ def forecast_figure(
     one = replace(dataset, trajectories=(dataset[number],))
     ahead = forecast(model, one, horizons)[0]
     mean = training_mean(model)
-    drawn = {
-        method: replace(ahead, values=baselines.forecast(truth, ahead.times, method, mean))
+    drawn: dict[str, Trajectory] = {
+        method: Trajectory(
+            ahead.times,
+            baselines.forecast(truth, ahead.times, method, mean),
+            observed=ahead.observed,
+            names=ahead.names,
+            units=ahead.units,
+        )
         for method in baselines.forecasters()
     }
     drawn[model.name] = ahead
