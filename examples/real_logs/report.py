@@ -60,7 +60,8 @@ def front_page(summaries: Sequence[Summary]) -> str:
                 best = min(errors, key=lambda name: errors[name])
                 ours = _mean(summary.scaled(test, task, own))
                 bold = "**" if ours < errors[best] else ""
-                row += [f"{errors[best]:.3g} ({_label(summary, best)})", f"{bold}{ours:.3g}{bold}"]
+                name = _label(summary, best).removesuffix(" (both sides)")
+                row += [f"{errors[best]:.3g} ({name})", f"{bold}{ours:.3g}{bold}"]
             rows.append(row)
     return _table(head, rows)
 
