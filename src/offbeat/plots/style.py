@@ -38,7 +38,7 @@ STYLES: dict[str, Style] = {
     "constant_velocity": Style("Constant velocity", "#BB5566", "", _DOTTED),
     "causal": Style("Model, causal", "#33BBEE", "", _DASHED),
     "two_sided": Style("Model, two-sided", "#CC3311", ""),
-    "blend": Style("Blend", "#CC3311", ""),
+    "blend": Style("Blend", "#AA3377", "o"),
     "gru": Style("GRU", "#56B4E9", "o", _DOTTED),
     "gru_d": Style("GRU-D", "#E69F00", "s", _DASH_DOT),
     "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),
