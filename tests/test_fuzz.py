@@ -25,7 +25,7 @@ def test_an_unchanged_file_is_read(name, tmp_path, monkeypatch):
 
 
 def test_a_fault_is_found(tmp_path, monkeypatch):
-    """A reader that raises, hangs, or prints control characters is told apart."""
+    """The outcome of a reader that raises, hangs, or prints control characters names the fault."""
     good = fuzz.prepared("csv", tmp_path / "good")
     for error, said in (
         (KeyError("x"), "KeyError: 'x'"),

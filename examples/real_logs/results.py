@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +108,7 @@ def described(log: Log, seed: int) -> dict[str, Any]:
         "log": log.name,
         "title": log.title,
         "seed": seed,
-        "command": " ".join(["python -m examples.real_logs", *sys.argv[1:]]),
+        "command": " ".join(["python -m examples.real_logs", *_options(sys.argv[1:])]),
         "machine": machine(),
         "rows": {
             "train": sum(t.rows for t in log.train),
@@ -124,6 +124,17 @@ def described(log: Log, seed: int) -> dict[str, Any]:
         },
         "predictors": {},
     }
+
+
+def _options(given: Sequence[str]) -> list[str]:
+    """Options of a command without the places it writes to, which change no number."""
+    places = ("--out", "--document", "--readme", "--figures")
+    after = ("", *given[:-1])
+    return [
+        word
+        for word, before in zip(given, after, strict=True)
+        if before not in places and word.partition("=")[0] not in places
+    ]
 
 
 def machine() -> dict[str, Any]:

@@ -256,10 +256,6 @@ class Blend:
         own |= {f"stack.{k}": v for k, v in self.stack.arrays().items()}
         return own | {f"both.{k}": v for k, v in self.both.arrays().items()}
 
-    def restored(self, arrays: Mapping[str, Array]) -> Blend:
-        """This blend with other tables."""
-        return replace(self, **tables_of(arrays))
-
 
 def tables_of(arrays: Mapping[str, Array]) -> dict[str, Any]:
     """Fields of a blend from `Blend.arrays`."""
@@ -337,12 +333,10 @@ def fit_blend(
     stack, cells, held_out = fit_stack(causal, *parts, span_s=span, gap_s=gap)
     models = model_rows(model, parts[1], seed=seed)
     count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
-    base = stack.predict(parts[1])
-    errors = errors_of(cells, [held_out, base], count_of, stack.keys.groups)
+    errors = errors_of(cells, [held_out], count_of, stack.keys.groups)
     gamma, answer = gated(
         errors,
         errors.predictions[:, 0],
-        errors.predictions[:, 1],
         None if models is None else cells.pick(models),
         train.channels,
     )

@@ -40,9 +40,6 @@ from offbeat.data.trajectory import Dataset, Trajectory
 EDGE = 0.15
 """Values with s (1 - s) below this are near the edge of their gap."""
 
-CAUSAL_ANSWER = "causal"
-"""Name of the causal answer among the predictors."""
-
 
 @dataclass(frozen=True, eq=False)
 class Sides:
@@ -273,21 +270,19 @@ def fit_both_sides(
     errors, models = flat[1]
     errors = replace(errors, count=independent_tasks(keys.lengths(), validation_span_s, gap_s))
     held_out = (first[errors.key, errors.channel] * errors.predictions).sum(axis=1)
-    base = (weights[errors.key, errors.channel] * errors.predictions).sum(axis=1)
-    gamma, answer = gated(errors, held_out, base, models, channels)
+    gamma, answer = gated(errors, held_out, models, channels)
     widths = fit_half_widths(errors, answer, channels)
     return BothSides(fitted, keys, weights, gamma, widths, units)
 
 
 def gated(
-    errors: Errors, held_out: Array, base: Array, models: Array | None, channels: int
+    errors: Errors, held_out: Array, models: Array | None, channels: int
 ) -> tuple[Array, Array]:
     """Gamma of a model, and answers for the intervals with gamma from the other half of the tasks.
 
     Args:
         errors: of validation tasks.
         held_out: (values,) base with weights that were not fitted to them.
-        base: (values,) the base.
         models: (values,) the model, or None.
         channels: their number.
 
@@ -296,7 +291,7 @@ def gated(
     """
     if models is None:
         return np.zeros((errors.keys, channels)), held_out
-    gamma = gate(errors, base, models, channels)
+    gamma = gate(errors, held_out, models, channels)
     answer = held_out.copy()
     half = errors.task % 2
     for k in (0, 1):

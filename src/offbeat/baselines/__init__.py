@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from offbeat.baselines.simple import (
     Pchip,
     RunningMean,
 )
+from offbeat.data.rows import add_rows
 from offbeat.data.trajectory import Dataset, Trajectory
 
 __all__ = [
@@ -116,10 +116,5 @@ def forecast(trajectory: Trajectory, times: Array, method: str, mean: Sequence[f
         InputError: there is no such baseline, or it is not causal.
     """
     checked_causal(method)
-    union = np.union1d(trajectory.times, times)
-    own = np.searchsorted(union, trajectory.times)
-    values = np.full((len(union), trajectory.channels), np.nan)
-    observed = np.zeros(values.shape, dtype=bool)
-    values[own], observed[own] = trajectory.values, trajectory.observed
-    extended = replace(trajectory, times=union, values=values, observed=observed)
-    return fill(extended, method, mean)[np.searchsorted(union, times)]
+    extended = add_rows(trajectory, times)
+    return fill(extended, method, mean)[np.searchsorted(extended.times, times)]

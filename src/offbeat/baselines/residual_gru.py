@@ -36,7 +36,7 @@ FURTHEST = 20.0
 class ResidualGru(CausalBaseline):
     """A gated recurrent unit (Cho et al., 2014) whose output is added to the last value.
 
-    It knows nothing of dynamics: its state changes at observations only, and an asked time is an
+    It has no model of the dynamics: its state changes at observations only, and an asked time is an
     input of the read-out. A neural model that predicts worse than this one gains nothing from its
     structure. Inputs of a row with observations are the values, their changes since the last ones,
     what is observed and the times since observation; the read-out is a layer on the state and on

@@ -8,7 +8,6 @@ length fit into the data.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -287,14 +286,3 @@ def _robust(missed: Array) -> Array:
     """Weights below 1 for values that every predictor misses by far."""
     weights: Array = np.minimum(1.0, OUTLIER / np.maximum(np.abs(missed).min(axis=1), 1e-12)) ** 2
     return weights
-
-
-def ordered(names: Sequence[str], weights: Array) -> list[tuple[str, float]]:
-    """Names with their mean weight, the largest first.
-
-    Args:
-        names: of the predictors.
-        weights: (..., predictors).
-    """
-    mean = weights.reshape(-1, len(names)).mean(axis=0)
-    return sorted(zip(names, mean.tolist(), strict=True), key=lambda item: -item[1])

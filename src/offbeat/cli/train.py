@@ -11,9 +11,6 @@ from offbeat.cli.common import FOUND, READER_FILE, plain, read_planned, say
 from offbeat.config import ModelConfig, SplitConfig, TrainConfig, check_seed, from_mapping
 from offbeat.errors import InputError, one_of
 
-LONG = 2000
-"""Rows of a training trajectory above which a note recommends windows."""
-
 
 def train_command(
     data: Path,
