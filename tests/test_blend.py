@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -195,6 +196,17 @@ def test_intervals_grow_with_the_time_since_observation(blend):
     assert half[125] > 2 * half[100]
 
 
+def test_few_validation_data_are_named(blend):
+    members = {"causal": ["last_value"], "two_sided": ["linear"]}
+    config = TaskConfig(horizon_s=0.3, gap_s=0.01)
+    short = fit_blend(waves(0), waves(1, 1), tasks=config, **members)  # 2 s to validate on
+    assert short.widths.count.max() > 20  # enough just after an observation
+    (note,) = short.notes()
+    assert "need 20 independent spans" in note
+    long = fit_blend(waves(0), waves(1, 12), tasks=replace(config, horizon_s=0.1), **members)
+    assert long.notes() == ()
+
+
 def test_asked_times_change_no_other_answer(blend):
     t = waves(3, 1)[0]
     observed = np.ones_like(t.observed)
@@ -211,8 +223,6 @@ def test_asked_times_change_no_other_answer(blend):
 
 
 def test_what_is_saved_answers_the_same(blend):
-    from dataclasses import replace
-
     again = replace(blend, **tables_of(blend.arrays()))
     test = draw_tasks(waves(2, 4), blend.tasks, 20, seed=5)
     for ask in ("causal", "fill"):

@@ -189,7 +189,8 @@ def train_blend(
         progress: show progress bars.
 
     Returns:
-        The blend, the training of the forward model, and sentences on the choice of the model.
+        The blend, the training of the forward model, and sentences on the choice of the model,
+        and those of `Blend.notes`.
     """
     folder = Path(out) if out is not None else None
     kind: Any = scaler or ("standardise" if as_it_is else "robust")
@@ -247,7 +248,7 @@ def train_blend(
     )
     if folder is not None:
         save_blend(blend, folder)
-    return blend, fitted, said
+    return blend, fitted, (*said, *blend.notes())
 
 
 def _said(result: LadderResult) -> str:

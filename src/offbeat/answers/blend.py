@@ -30,6 +30,7 @@ from offbeat.answers.both_sides import (
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
 from offbeat.baselines.base import BASELINES, Array, namespace
 from offbeat.baselines.history import typical_gap
+from offbeat.baselines.kalman_groups import MotionFilter
 from offbeat.baselines.simple import as_index, as_kind, channels_of
 from offbeat.baselines.stack import (
     LEVELS,
@@ -55,6 +56,9 @@ FARTHEST = 1e6
 
 LARGEST = 4e6
 """Values in the tasks that are drawn from a part, about, at most."""
+
+_SURE = 0.95
+"""Highest level of intervals whose calibration is checked."""
 
 TASKS = 800
 """Tasks that are drawn from the training data and from the validation data, at most."""
@@ -239,6 +243,30 @@ class Blend:
         for c, name in enumerate(self.names):
             lines.append([name, *(f"{g:.2f}" for g in usual[:, c])])
         return plain(lines)
+
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on groups of channels that were found, and on intervals from few data."""
+        found = []
+        for member in self.stack.members.values():
+            if isinstance(member, MotionFilter) and member.has_groups:
+                groups = member.describe(self.names).replace("\n", "; ")
+                found.append(f"filtered together: {groups}")
+        # A level needs as many independent values as make one miss likely.
+        needed = 1 / (1 - _SURE)
+        counts = self.widths.count[LEVELS - 1 :: LEVELS]
+        short = [
+            (float(edge), int(count))
+            for edge, count in zip(self.stack.keys.bins.edges, counts, strict=False)
+            if count < needed
+        ]
+        if short:
+            edge, count = short[-1]
+            found.append(
+                f"intervals of {100 * _SURE:.0f} % need {needed:.0f} independent spans of the "
+                f"validation data; up to {edge:.3g} s after an observation there are {count}, so "
+                "they are rough there: record more, or ask for a shorter horizon"
+            )
+        return tuple(found)
 
     def save(self, path: str | Path) -> None:
         """Writes the blend and its models to a folder; `load_run` reads it.
