@@ -129,12 +129,14 @@ def described(log: Log, seed: int) -> dict[str, Any]:
 def _options(given: Sequence[str]) -> list[str]:
     """Options of a command without the places it writes to, which change no number."""
     places = ("--out", "--document", "--readme", "--figures")
-    after = ("", *given[:-1])
-    return [
-        word
-        for word, before in zip(given, after, strict=True)
-        if before not in places and word.partition("=")[0] not in places
-    ]
+    kept: list[str] = []
+    words = iter(given)
+    for word in words:
+        if word in places:
+            next(words, None)
+        elif word.partition("=")[0] not in places:
+            kept.append(word)
+    return kept
 
 
 def machine() -> dict[str, Any]:
