@@ -37,6 +37,10 @@ check: .venv/.test ## install, then lint, check the format and the types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+.PHONY: docs
+docs: .venv/.test ## install, then build the documentation site into site/, without a warning
+	$(BIN)/zensical build --strict
+
 MUTANTS ?= 1000
 
 .PHONY: fuzz
@@ -60,7 +64,7 @@ sanitize: .venv/.test ## build the kernel with sanitizers, then run its tests
 
 .PHONY: clean
 clean: ## remove .venv and everything that was built or cached
-	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist site .cache .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/.made:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from offbeat.config import ModelConfig, SplitConfig, TrainConfig
+from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig
 from offbeat.errors import (
     DivergenceError,
     FileFormatError,
@@ -68,7 +68,6 @@ _PUBLIC = {
     "Scores": "metrics",
     "Stream": "stream.stream",
     "StreamOptions": "stream.options",
-    "TaskConfig": "config",
     "Trajectory": "data.trajectory",
     "compare": "comparison",
     "evaluate": "evaluation",
