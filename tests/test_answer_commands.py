@@ -72,7 +72,8 @@ def test_a_run_holds_a_blend_of_both_models_and_says_who_wins(run):
     assert {"blend", "linear", "pchip"} <= set(filled["rmse_in_units"])
     assert set(filled["rmse_in_units"]["linear"]) == set(NAMES)
     assert "win" in filled["verdict"]
-    assert set(filled["coverage"]) == {"0.5", "0.8", "0.95"}
+    for score in ("coverage", "interval_score_scaled"):
+        assert set(filled[score]) == {"0.5", "0.8", "0.95"}
     config = yaml.safe_load((run / "config.yaml").read_text())
     assert config["two_sided"] is True
     assert config["reader"] == {"time_column": "stamp", "time_unit": "ms", "outliers": "mask"}
@@ -194,13 +195,14 @@ def test_other_data_is_masked_in_any_way_and_scored_as_a_whole(run, log, tmp_pat
 def test_figures_are_written_on_request(run, log, tmp_path):
     from PIL import Image
 
-    paths = [tmp_path / f"{name}.png" for name in ("fill", "ahead", "scored")]
+    paths = [tmp_path / f"{name}.png" for name in ("fill", "ahead", "scored", "kept")]
     table_of = str(tmp_path / "a.csv")
     for arguments in (
         ["impute", str(run), str(log), table_of, f"--figure={paths[0]}", "--channels=[tilt]"],
         ["forecast", str(run), str(log), table_of, "--horizons=[0.1, 0.2]",
          f"--figure={paths[1]}"],
-        ["evaluate", str(run), str(log), f"--figure={paths[2]}", "--trajectory=0"],
+        ["evaluate", str(run), str(log), f"--figure={paths[2]}", "--trajectory=0",
+         f"--calibration={paths[3]}"],
     ):  # fmt: skip
         assert main(arguments) == 0
     for path in paths:

@@ -15,6 +15,7 @@ import offbeat as ob
 from offbeat.answers.both_sides import reversed_in_time
 from offbeat.answers.scoring import ChannelScores, _targets
 from offbeat.baselines import fill, fillers, forecast, forecasters
+from offbeat.calibration import interval_score
 from offbeat.data.rows import add_rows, times_at_rate
 
 NAN = float("nan")
@@ -270,6 +271,11 @@ def test_imputation_is_scored_by_its_definition_on_the_same_values_for_all(mode)
             for t, v, w, h in zip(data, filled, half, masked, strict=True)
         ]
         assert share == pytest.approx(np.concatenate(inside).mean())
+        each = [
+            (interval_score(t.values, *v.interval(level), level) / scale)[h]
+            for t, v, h in zip(data, filled, masked, strict=True)
+        ]
+        assert scores.interval_score[level] == pytest.approx(np.concatenate(each).mean())
 
 
 def test_groups_of_gaps_partition_the_values_between_observations():

@@ -191,6 +191,12 @@ def test_quantiles_of_the_right_distribution_cover_and_have_its_crps():
     found = scores.score(task, Gaussian([np.zeros((40_000, 1))]), np.ones(1))
     for wide, coverage in found["coverage"].items():
         assert coverage == pytest.approx(float(wide), abs=0.01)
+    alpha, half = 0.05, norm.ppf(0.975)
+    score = 4 * norm.pdf(half) / alpha  # its expectation
+    assert found["interval_score_scaled"]["0.95"] == pytest.approx(score, rel=0.02)
+    assert found["widths_scaled"] == {
+        "1.28": pytest.approx(2 * norm.ppf(0.95))
+    }  # rows are 1 s apart
     # E CRPS of N(0, 1) for y ~ N(0, 1) is 1 / sqrt(pi); the steps of 2.5 % cost less than 1 %.
     assert found["crps_scaled"] == pytest.approx(1 / math.sqrt(math.pi), rel=0.015)
 
@@ -201,7 +207,7 @@ def test_crps_is_in_scaled_units_and_grows_with_the_error():
     for y in at:
         # Gneiting and Raftery 2007, equation 21
         closed = y * (2 * norm.cdf(y) - 1) + 2 * norm.pdf(y) - 1 / math.sqrt(math.pi)
-        found = scores.calibration(np.array([y]), quantiles[None])["crps_scaled"]
+        found = scores.intervals(np.array([y]), quantiles[None], np.ones(1))["crps_scaled"]
         assert found == pytest.approx(closed, rel=0.02)
 
 
@@ -265,12 +271,16 @@ def test_intervals_of_a_blend_are_scored(ran):
     out, _ = ran
     summary = results.Summary([out / "lasa" / "quick_seed0.json"])
     for task in summary.tasks("test"):
-        coverage, crps = summary.intervals("test", task, "offbeat_blend")
+        found = summary.intervals("test", task, "offbeat_blend")
+        coverage, crps = found.coverage, found.crps
         assert 0 <= coverage["0.5"] <= coverage["0.8"] <= coverage["0.95"] <= 1
         # The mean absolute error of the point forecast is the CRPS without a spread, and the RMSE
         # is not less than that.
         (rmse,) = summary.scaled("test", task, "offbeat_blend")
         assert 0 < crps < rmse
+        assert set(found.score) == set(coverage)
+        assert found.score["0.95"] > 0
+        assert all(width > 0 for width in found.widths.values())
     assert summary.intervals("test", "one step", "last_value") is None
     assert "| Offbeat blend |" in report.intervals(summary, "test")
 

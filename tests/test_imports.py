@@ -26,6 +26,7 @@ STAGES = (
     "kernels",
     "parts",
     "models",
+    "calibration",
     "metrics",
     "examples",
     "run",

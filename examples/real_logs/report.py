@@ -9,7 +9,7 @@ import numpy as np
 from offbeat.errors import InputError
 
 from .predictors import ORACLE, ORACLE_TWO_SIDED
-from .results import Summary
+from .results import Intervals, Summary
 from .scores import Against
 
 
@@ -84,7 +84,7 @@ def tables(summary: Summary, *, every: bool = False) -> str:
             comparisons(summary, test, list(summary.predictors) if every else shown(summary, test)),
         ]
         if calibrated := intervals(summary, test):
-            parts += [f"{title}coverage of 50 / 80 / 95 % intervals; CRPS, scaled", calibrated]
+            parts += [f"{title}{INTERVALS}", calibrated]
     return "\n\n".join(parts)
 
 
@@ -130,6 +130,9 @@ def groups(summary: Summary, test: str) -> str:
             rows.append(row)
     return _table(["", "", *asked], rows)
 
+
+INTERVALS = "coverage of 50 / 80 / 95 % intervals; CRPS; interval score of 95 %, scaled"
+"""Title of the table of `intervals`."""
 
 KINDS = ("one step", "fill", "forecast")
 """First words of the names of tasks."""
@@ -217,7 +220,15 @@ def comparisons(summary: Summary, test: str, names: Sequence[str]) -> str:
 
 
 def intervals(summary: Summary, test: str) -> str:
-    """Coverage of 50, 80 and 95 % intervals, in percent, and CRPS, per task; empty without them."""
+    """Coverage of 50, 80 and 95 % intervals, in percent, CRPS, and the score of 95 % intervals.
+
+    Args:
+        summary: of the log.
+        test: name of the test part.
+
+    Returns:
+        A row per predictor and a column per task; empty without intervals.
+    """
     rows = []
     for name in summary.predictors:
         each = [summary.intervals(test, task, name) for task in summary.tasks(test)]
@@ -226,11 +237,12 @@ def intervals(summary: Summary, test: str) -> str:
     return _table(["", *summary.tasks(test)], rows) if rows else ""
 
 
-def _calibration(found: tuple[dict[str, float], float] | None) -> str:
+def _calibration(found: Intervals | None) -> str:
     if found is None:
         return ""
-    coverage, crps = found
-    return f"{' / '.join(f'{100 * c:.0f}' for c in coverage.values())}; {_number(crps)}"
+    covered = " / ".join(f"{100 * found.coverage[level]:.0f}" for level in ("0.5", "0.8", "0.95"))
+    score = f"; {_number(found.score['0.95'])}" if found.score else ""
+    return f"{covered}; {_number(found.crps)}{score}"
 
 
 def _label(summary: Summary, name: str) -> str:

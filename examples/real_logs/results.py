@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,27 @@ def _plain(found: Mapping[str, Any]) -> dict[str, Any]:
     return {**found, "rmse": rmse}
 
 
+@dataclass(frozen=True)
+class Intervals:
+    """Scores of intervals, means over seeds; keys are as in the files.
+
+    Attributes:
+        coverage: by level.
+        score: interval score by level, scaled.
+        widths: of intervals of 90 % by the longest time since observation in s, scaled.
+        crps: scaled.
+    """
+
+    coverage: dict[str, float]
+    score: dict[str, float]
+    widths: dict[str, float]
+    crps: float
+
+
+def _means(each: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    return {key: float(np.mean([one[key] for one in each])) for key in (each[0] if each else {})}
+
+
 class Summary:
     """The results of a log, over its seeds.
 
@@ -201,13 +223,16 @@ class Summary:
         """RMSE over all channels in scaled units, per seed; empty if not asked."""
         return self._of(test, task, name, "rmse_scaled")
 
-    def intervals(self, test: str, task: str, name: str) -> tuple[dict[str, float], float] | None:
-        """Coverage by interval, and CRPS in scaled units; means over seeds; None without them."""
+    def intervals(self, test: str, task: str, name: str) -> Intervals | None:
+        """Scores of the intervals of a predictor, means over seeds; None without them."""
         coverage = self._of(test, task, name, "coverage")
         if not coverage:
             return None
-        mean = {wide: float(np.mean([each[wide] for each in coverage])) for wide in coverage[0]}
-        return mean, float(np.mean(self._of(test, task, name, "crps_scaled")))
+        score, widths = (
+            self._of(test, task, name, key) for key in ("interval_score_scaled", "widths_scaled")
+        )
+        crps = float(np.mean(self._of(test, task, name, "crps_scaled")))
+        return Intervals(_means(coverage), _means(score), _means(widths), crps)
 
     def grouped(self, test: str, task: str, name: str) -> dict[str, float]:
         """RMSE over the values of each group of channels, in their unit; NaN without values."""

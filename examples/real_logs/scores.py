@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat import calibration
+from offbeat.calibration import CalibrationSums
 from offbeat.errors import InputError
 
 from .predictors import Predictor
@@ -25,8 +27,11 @@ FLOOR = 1e-9
 LEVELS = np.arange(1, 40) / 40
 """Quantiles that are asked for: steps of 2.5 %."""
 
-INTERVALS = (0.5, 0.8, 0.95)
-"""Central intervals whose coverage is scored."""
+INTERVALS = calibration.LEVELS
+"""Central intervals that are scored; their ends are among `LEVELS`."""
+
+AGES_S = 0.01
+"""s; widths of intervals are kept by time since observation, up to 1, 2, 4, 8, ... times this."""
 
 
 def score(task: Task, predictor: Predictor, scale: Array) -> dict[str, Any]:
@@ -39,8 +44,7 @@ def score(task: Task, predictor: Predictor, scale: Array) -> dict[str, Any]:
 
     Returns:
         `rmse_scaled` over all scored values, `rmse` (channels,) in units, NaN where no value of the
-        channel is scored, and where the predictor has quantiles `crps_scaled` and `coverage`, the
-        fraction of the values within each interval.
+        channel is scored, and where the predictor has quantiles what `intervals` returns.
 
     Raises:
         InputError: a prediction is missing or not finite.
@@ -60,7 +64,8 @@ def score(task: Task, predictor: Predictor, scale: Array) -> dict[str, Any]:
     found: dict[str, Any] = {"rmse_scaled": float(np.sqrt(squares.mean())), "rmse": rmse}
     if hasattr(predictor, "quantiles"):
         quantiles = _chosen(predictor.quantiles(task.dataset, LEVELS), task)
-        found |= calibration(truth / scale[channel], quantiles / scale[channel][:, None])
+        age = _chosen((_elapsed(t.times, t.observed) for t in task.dataset), task)
+        found |= intervals(truth / scale[channel], quantiles / scale[channel][:, None], age)
     return found
 
 
@@ -74,8 +79,16 @@ def _chosen(values: Iterable[Array], task: Task) -> Array:
     return np.concatenate([v[m] for v, m in zip(values, task.scored, strict=True)])
 
 
-def calibration(truth: Array, quantiles: Array) -> dict[str, Any]:
-    """Continuous ranked probability score, and coverage of central intervals.
+def _elapsed(times: Array, observed: NDArray[np.bool_]) -> Array:
+    """(rows, channels) s since the channel was observed in an earlier row; NaN where it was not."""
+    last = np.full(observed.shape, np.nan)
+    at = np.where(observed, times[:, None], np.nan)
+    last[1:] = np.fmax.accumulate(at, axis=0)[:-1]
+    return np.asarray(times[:, None] - last)
+
+
+def intervals(truth: Array, quantiles: Array, age: Array) -> dict[str, Any]:
+    """Coverage and score of central intervals, and the continuous ranked probability score.
 
     CRPS = 2 int_0^1 (1{y < q(p)} - p) (q(p) - y) dp (Gneiting and Raftery 2007, Journal of the
     American Statistical Association 102), by the trapezoidal rule over `LEVELS`, 0 at both ends.
@@ -83,18 +96,31 @@ def calibration(truth: Array, quantiles: Array) -> dict[str, Any]:
     Args:
         truth: (values,) scaled.
         quantiles: (values, levels) scaled, at `LEVELS`.
+        age: (values,) s since the channel was observed.
 
     Returns:
-        `crps_scaled`, and `coverage` by interval.
+        `crps_scaled`; `coverage`, the fraction of the values within each interval, and
+        `interval_score_scaled`, by interval; `widths_scaled`, the mean width of intervals of 90 %,
+        by the longest time since observation in s.
     """
     above = quantiles - truth[:, None]
     loss = np.where(above > 0, 1 - LEVELS, -LEVELS) * above
-    coverage = {}
-    for wide in INTERVALS:
-        low, high = _at(quantiles, 0.5 - wide / 2), _at(quantiles, 0.5 + wide / 2)
-        coverage[f"{wide:g}"] = float(((low <= truth) & (truth <= high)).mean())
-    crps = 2 * loss.sum(axis=1).mean() / (len(LEVELS) + 1)
-    return {"crps_scaled": float(crps), "coverage": coverage}
+    crps = 2 * loss.sum(axis=1) / (len(LEVELS) + 1)
+    low, high = (
+        np.stack([_at(quantiles, 0.5 + side * wide / 2) for wide in INTERVALS], axis=1)
+        for side in (-1, 1)
+    )
+    sums = CalibrationSums(INTERVALS, age_unit=AGES_S)
+    sums.add(truth, low, high, crps, age)
+    found = sums.result()
+    assert found is not None
+    names = [f"{level:g}" for level in found.levels]
+    return {
+        "crps_scaled": found.crps,
+        "coverage": dict(zip(names, found.coverage, strict=True)),
+        "interval_score_scaled": dict(zip(names, found.interval_score, strict=True)),
+        "widths_scaled": {f"{a.up_to_s:g}": a.width for a in found.by_age},
+    }
 
 
 def _at(quantiles: Array, level: float) -> Array:

@@ -396,7 +396,7 @@ class ValidationSet:
                 # One generator for all parts, as if they were one batch.
                 generator = torch.Generator().manual_seed(seed) if model.needs_generator else None
                 found: Prediction = model.run(prepared, generator=generator)
-                sums.add(found.mean, part)
+                sums.add(found.mean, part, found.scale)
                 means.append(found.mean)
         return sums.scores(), means
 

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from offbeat.calibration import Calibration, CalibrationSums, normal_crps, normal_half_widths
 from offbeat.data.batch import Batch, delta, last_index, last_values
 from offbeat.tables import plain
 
@@ -69,6 +70,8 @@ class Scores:
         published: all rows, where the prediction of row 0 is the observed row 0, filled with zeros
             where it is masked: what the thesis reports.
         by_gap: after the first observation, by the time since the channel's last observation.
+        calibration: of the distributions predicted by a model that has a scale, after the first
+            observation, in scaled units; None for others.
     """
 
     after_first_observation: Score
@@ -76,6 +79,7 @@ class Scores:
     after_first_row: Score
     published: Score
     by_gap: tuple[GapScore, ...]
+    calibration: Calibration | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form; a score without values has null for its error."""
@@ -83,7 +87,7 @@ class Scores:
         result["by_gap"] = [
             {"above_s": g.above, "up_to_s": g.up_to, **_plain(g.score)} for g in self.by_gap
         ]
-        return result
+        return result if self.calibration is None else result | self.calibration.to_dict()
 
 
 def null_if_nan(value: float) -> float | None:
@@ -113,13 +117,15 @@ class ScoreSums:
         self.channels = channels
         self.gap_unit = gap_unit
         self._sums: dict[str | int, tuple[Tensor, Tensor]] = {}
+        self._calibration = CalibrationSums(age_unit=gap_unit)
 
-    def add(self, predictions: Tensor, batch: Batch) -> None:
+    def add(self, predictions: Tensor, batch: Batch, scale: Tensor | None = None) -> None:
         """Adds a batch.
 
         Args:
             predictions: (batch, rows, channels) in the units of `batch.values`.
             batch: the observed and known values.
+            scale: (batch, rows, channels) standard deviations of the predictions, if they have any.
         """
         squared = (predictions.double() - batch.values.double()) ** 2
         known = batch.targets
@@ -133,10 +139,29 @@ class ScoreSums:
         self._add("after_first_row", squared, later)
         shown = torch.where(mask[:, 0], 0.0, batch.values[:, 0].double() ** 2)
         self._add("published", torch.cat([shown[:, None], squared[:, 1:]], dim=1), known)
-        if self.gap_unit is not None:
-            group = gap_groups(delta(batch.times, mask), self.gap_unit)
+        elapsed = None if self.gap_unit is None else delta(batch.times, mask)
+        if scale is not None:
+            self._add_distributions(predictions, batch, scale, counted, elapsed)
+        if self.gap_unit is not None and elapsed is not None:
+            group = gap_groups(elapsed, self.gap_unit)
             for k in torch.unique(group[counted]).tolist():
                 self._add(int(k), squared, counted & (group == k))
+
+    def _add_distributions(
+        self,
+        predictions: Tensor,
+        batch: Batch,
+        scale: Tensor,
+        counted: Tensor,
+        elapsed: Tensor | None,
+    ) -> None:
+        truth, mean, spread = (
+            a.double()[counted].cpu().numpy() for a in (batch.values, predictions, scale)
+        )
+        half = normal_half_widths(spread)
+        low, high = mean[:, None] - half, mean[:, None] + half
+        age = None if elapsed is None else elapsed[counted].cpu().numpy()
+        self._calibration.add(truth, low, high, normal_crps(truth - mean, spread), age)
 
     def _add(self, name: str | int, squared: Tensor, counts: Tensor) -> None:
         total = torch.where(counts, squared, 0.0).sum(dim=(0, 1))
@@ -154,7 +179,7 @@ class ScoreSums:
             for k in groups
         )
         named = {name: self._score(name) for name in SCORINGS}
-        return Scores(**named, by_gap=by_gap)
+        return Scores(**named, by_gap=by_gap, calibration=self._calibration.result())
 
     def _score(self, name: str | int) -> Score:
         if name not in self._sums:

@@ -44,7 +44,7 @@ class Answer(Trajectory):
         Raises:
             InputError: the level is out of range, or the answer has no intervals.
         """
-        return half_width(self._levels(), level)
+        return half_width(self.half_widths(), level)
 
     def interval(self, level: float = 0.9) -> tuple[Array, Array]:
         """Lower and upper end of the interval that holds the true value with a probability.
@@ -67,9 +67,14 @@ class Answer(Trajectory):
         Args:
             truth: (rows, channels).
         """
-        return crps(self._levels(), truth - self.values)
+        return crps(self.half_widths(), truth - self.values)
 
-    def _levels(self) -> Array:
+    def half_widths(self) -> Array:
+        """(rows, channels, levels) half widths at every level of `intervals.LEVELS`.
+
+        Raises:
+            InputError: the answer has no intervals.
+        """
         if self.widths is None or self.key is None or self.unit is None:
             raise InputError(
                 "these predictions have no intervals: they are of a model alone; fit a blend "

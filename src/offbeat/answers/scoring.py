@@ -15,17 +15,16 @@ from offbeat.answers.answer import Answer
 from offbeat.answers.blend import Blend, model_fills, model_rows
 from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
+from offbeat.answers.intervals import LEVELS, crps
 from offbeat.answers.predict import check_any_time
 from offbeat.baselines import Baseline, fill, fillers, forecasters
 from offbeat.baselines.history import typical_gap
+from offbeat.calibration import Calibration, CalibrationSums
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
 from offbeat.metrics import gap_groups, null_if_nan
 from offbeat.models.base import BaseModel, of_channels
-
-COVERED = (0.5, 0.8, 0.95)
-"""Levels of the intervals whose coverage is scored."""
 
 OVERALL = "all, scaled"
 """Name of the last row of a table: all channels, in units of their standard deviation."""
@@ -43,10 +42,8 @@ class ChannelScores:
         rmse: per predictor, per channel; NaN where a channel has no value.
         overall: per predictor, over the values of all channels, each in units of its scale.
         trivial: which of the predictors are baselines.
-        coverage: share of the values within the intervals of 50, 80 and 95 %, by that level; None
-            where the predictor has no intervals.
-        crps: continuous ranked probability score over the values of all channels, each in units of
-            its scale; None without intervals.
+        calibration: of the intervals of the first predictor, over the values of all channels, each
+            in units of its scale; None where it has no intervals.
     """
 
     task: str
@@ -56,8 +53,24 @@ class ChannelScores:
     rmse: Mapping[str, tuple[float, ...]]
     overall: Mapping[str, float]
     trivial: tuple[str, ...]
-    coverage: Mapping[float, float] | None = None
-    crps: float | None = None
+    calibration: Calibration | None = None
+
+    @property
+    def coverage(self) -> Mapping[float, float] | None:
+        """Fraction of the values within the intervals of 50, 80 and 95 %; None without any."""
+        found = self.calibration
+        return None if found is None else found.shown(found.coverage)
+
+    @property
+    def interval_score(self) -> Mapping[float, float] | None:
+        """Mean interval score at 50, 80 and 95 %, scaled; None without intervals."""
+        found = self.calibration
+        return None if found is None else found.shown(found.interval_score)
+
+    @property
+    def crps(self) -> float | None:
+        """Mean continuous ranked probability score, scaled; None without intervals."""
+        return None if self.calibration is None else self.calibration.crps
 
     def table(self) -> str:
         """A plain-text table with a row per channel and a column per predictor."""
@@ -112,14 +125,8 @@ class ChannelScores:
             },
             "rmse_scaled": {name: null_if_nan(value) for name, value in self.overall.items()},
             "verdict": self.verdict(),
-            **self._intervals(),
+            **({} if self.calibration is None else self.calibration.to_dict()),
         }
-
-    def _intervals(self) -> dict[str, Any]:
-        if self.coverage is None:
-            return {}
-        covered = {f"{level:g}": share for level, share in self.coverage.items()}
-        return {"coverage": covered, "crps_scaled": self.crps}
 
     def short(self) -> str:
         """A plain-text table with a row per channel: the predictor, and the best baseline."""
@@ -155,15 +162,22 @@ class ErrorSums:
         names: of the channels.
         units: of the channels.
         scale: (channels,) in the unit of each channel, for the error over all channels.
+        gap_s: s; widths of intervals are kept by time since observation, in multiples of it.
     """
 
-    def __init__(self, names: Sequence[str], units: Sequence[str], scale: ArrayLike) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        units: Sequence[str],
+        scale: ArrayLike,
+        *,
+        gap_s: float | None = None,
+    ) -> None:
         self.names, self.units = tuple(names), tuple(units)
         self.scale = np.asarray(scale, dtype=np.float64)
         self._counts = np.zeros(len(self.names), dtype=np.int64)
         self._sums: dict[str, NDArray[np.float64]] = {}
-        self._inside = dict.fromkeys(COVERED, 0)
-        self._crps: float | None = None
+        self._calibration = CalibrationSums(LEVELS.tolist(), age_unit=gap_s)
 
     def add(
         self,
@@ -183,21 +197,24 @@ class ErrorSums:
             squared = np.where(counted, values - truth, 0.0) ** 2
             self._sums[name] = self._sums.get(name, 0.0) + squared.sum(axis=0)
 
-    def add_intervals(
-        self, truth: NDArray[np.float64], answer: Answer, counted: NDArray[np.bool_]
-    ) -> None:
+    def add_intervals(self, truth: Trajectory, answer: Answer, counted: NDArray[np.bool_]) -> None:
         """Adds the intervals of rows that were added.
 
         Args:
-            truth: (rows, channels) known where counted.
+            truth: known where counted.
             answer: with intervals.
             counted: (rows, channels) values that are scored.
         """
-        true = np.where(counted, truth, answer.values)
-        for level in COVERED:
-            half = answer.half_width(level)
-            self._inside[level] += int((np.abs(true - answer.values) <= half)[counted].sum())
-        self._crps = (self._crps or 0.0) + float((answer.crps(true) / self.scale)[counted].sum())
+        scale = np.broadcast_to(self.scale, counted.shape)[counted]
+        true, predicted = truth.values[counted] / scale, answer.values[counted] / scale
+        half = answer.half_widths()[counted] / scale[:, None]
+        self._calibration.add(
+            true,
+            predicted[:, None] - half,
+            predicted[:, None] + half,
+            crps(half, true - predicted),
+            _elapsed(truth)[counted],
+        )
 
     def scores(self, task: str, trivial: Sequence[str]) -> ChannelScores:
         """The scores of all rows added so far."""
@@ -213,7 +230,6 @@ class ErrorSums:
             name: float((sums / self.scale**2).sum() / total) ** 0.5 if total else float("nan")
             for name, sums in self._sums.items()
         }
-        with_intervals = self._crps is not None and total > 0
         return ChannelScores(
             task,
             self.names,
@@ -222,8 +238,7 @@ class ErrorSums:
             each,
             overall,
             tuple(trivial),
-            {level: n / total for level, n in self._inside.items()} if with_intervals else None,
-            self._crps / total if self._crps is not None and total else None,
+            self._calibration.result(),
         )
 
 
@@ -331,7 +346,7 @@ def score_imputation(
         each = {name: values[i] for name, values in fills.items()}
         sums.add(trajectory.values, each, counted)
         if answers is not None:
-            sums.add_intervals(trajectory.values, answers[i], counted)
+            sums.add_intervals(trajectory, answers[i], counted)
         length = _gap_lengths(trajectory)
         group = gap_groups(torch.from_numpy(length), unit).numpy()
         for k in np.unique(group[counted & (length > 0)]).tolist():
@@ -453,7 +468,7 @@ def _scored(
         each = {n: values[i] for n, values in every.items()}
         sums.add(np.nan_to_num(trajectory.values), each, counted[i])
         if answers is not None:
-            sums.add_intervals(trajectory.values, answers[i], counted[i])
+            sums.add_intervals(trajectory, answers[i], counted[i])
     return sums.scores(name, tuple(baselines))
 
 
@@ -496,7 +511,8 @@ def training_mean(model: BaseModel | Blend) -> list[float]:
 
 
 def _sums_for(model: BaseModel | Blend) -> ErrorSums:
-    return ErrorSums(model.names, model.units, channel_scale(model))
+    gap = model.tasks.gap_s if isinstance(model, Blend) else None
+    return ErrorSums(model.names, model.units, channel_scale(model), gap_s=gap)
 
 
 def channel_scale(model: BaseModel | Blend) -> NDArray[np.float64]:
@@ -506,6 +522,14 @@ def channel_scale(model: BaseModel | Blend) -> NDArray[np.float64]:
         assert isinstance(model, Blend)
         return model.stack.scale
     return np.asarray(np.abs(own.scaler.scale) * np.array(own.statistics.std))
+
+
+def _elapsed(trajectory: Trajectory) -> NDArray[np.float64]:
+    """(rows, channels) s since the channel was observed in an earlier row; NaN where it was not."""
+    times = np.where(trajectory.observed, trajectory.times[:, None], np.nan)
+    before = np.full_like(times, np.nan)
+    before[1:] = np.fmax.accumulate(times, axis=0)[:-1]
+    return np.asarray(trajectory.times[:, None] - before)
 
 
 def _gap_lengths(trajectory: Trajectory) -> NDArray[np.float64]:

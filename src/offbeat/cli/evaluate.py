@@ -27,6 +27,7 @@ def evaluate_command(
     horizons: list[float] | float | None = None,
     out: Path | None = None,
     figure: Path | None = None,
+    calibration: Path | None = None,
     channels: list[str] | None = None,
     trajectory: int = 0,
     reader: dict[str, Any] | None = None,
@@ -55,6 +56,8 @@ def evaluate_command(
             parts of the longest one that it was trained for.
         out: JSON file for the scores.
         figure: .png, .pdf or .svg of one trajectory, its masked values and the fills.
+        calibration: .png, .pdf or .svg of the intervals: how many values are within those of each
+            level, and how wide they are by the time since an observation.
         channels: to plot; by default the first four.
         trajectory: to plot, counted from 0 within the part.
         reader: how the log is read. What is not given is read as in training, unless a format is
@@ -77,6 +80,7 @@ def evaluate_command(
     check_seed(seed)
     one_of("mask", mask, MASKS)
     check_figure(figure)
+    check_figure(calibration)
     after = None if horizons is None else checked_horizons(horizons).tolist()
     loaded = load_run(model)
     forward = loaded.forward if isinstance(loaded, Blend) else loaded
@@ -110,7 +114,9 @@ def evaluate_command(
     chosen = plotted_channels(loaded.names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = None if forward is None else evaluate(forward, dataset, seed=seed)
-    scores, text = scored(loaded, dataset, evaluation, horizons=after, seed=seed)
+    scores, text = scored(
+        loaded, dataset, evaluation, horizons=after, seed=seed, calibration=calibration
+    )
     result = {"part": part, **scores}
     if out is not None:
         write_json(out, result)
@@ -119,4 +125,6 @@ def evaluate_command(
     if figure is not None:
         fill_figure(loaded, dataset, figure, chosen, trajectory, seed=seed)
         result["figure"] = str(figure)
+    if calibration is not None:
+        result["calibration"] = str(calibration)
     say(result, f"{heading}\n{text}", json)

@@ -22,12 +22,14 @@ from offbeat.answers.scoring import (
     score_one_step,
     training_mean,
 )
+from offbeat.calibration import Calibration
 from offbeat.data.masking import masked_values
 from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.evaluation import Evaluation
 from offbeat.models.base import BaseModel
 from offbeat.plots.answers import answers
+from offbeat.plots.calibration import calibration_figure
 from offbeat.plots.figures import save
 
 
@@ -38,6 +40,7 @@ def scored(
     *,
     horizons: Sequence[float] | None = None,
     seed: int = 0,
+    calibration: Path | None = None,
 ) -> tuple[dict[str, Any], str]:
     """All scores of a model on a data set, as JSON and as text.
 
@@ -47,13 +50,27 @@ def scored(
         evaluation: the model's one-step-ahead scores.
         horizons: s; None scores no forecasts of a model, and those of a blend up to its horizon.
         seed: of models with self-feeding.
+        calibration: file of a figure of the coverage and the widths of intervals.
+
+    Raises:
+        InputError: there are no intervals for the figure.
     """
     if isinstance(model, Blend):
-        return _scored_blend(model, dataset, evaluation, horizons, seed)
+        return _scored_blend(model, dataset, evaluation, horizons, seed, calibration)
     assert evaluation is not None
+    own = evaluation.scores[model.name].calibration
+    if calibration is not None:
+        drawn = {} if own is None else {"one step ahead": own}
+        save(calibration_figure(drawn, title=dataset[0].origin), calibration)
     ahead = evaluation.in_units()
     result: dict[str, Any] = {**evaluation.to_dict(), "verdict": ahead.verdict()}
-    text = [evaluation.table(), "", "one step ahead, RMSE in the channels' units:", ahead.table()]
+    text = [
+        evaluation.table(),
+        *_intervals(model, own),
+        "",
+        "one step ahead, RMSE in the channels' units:",
+        ahead.table(),
+    ]
     verdicts = [ahead.verdict()]
     if any(masked_values(t).any() for t in dataset):
         imputed = score_imputation(model, dataset, seed=seed)
@@ -71,12 +88,28 @@ def scored(
     return result, "\n".join([*text, "", *verdicts])
 
 
+def _intervals(model: BaseModel, found: Calibration | None) -> list[str]:
+    """A line on the intervals of a model with a Gaussian head."""
+    if found is None:
+        return []
+    covered = ", ".join(
+        f"{100 * share:.0f} % of the values in those of {100 * level:.0f} %"
+        for level, share in found.shown(found.coverage).items()
+    )
+    score = found.shown(found.interval_score)[0.95]
+    return [
+        f"intervals of {model.name}: {covered}; CRPS {found.crps:.4g}, interval score of 95 % "
+        f"{score:.4g} (scaled)"
+    ]
+
+
 def _scored_blend(
     blend: Blend,
     dataset: Dataset,
     evaluation: Evaluation | None,
     horizons: Sequence[float] | None,
     seed: int,
+    calibration: Path | None,
 ) -> tuple[dict[str, Any], str]:
     """All tasks of a blend, on the same values as its model and its baselines."""
     tasks = [score_one_step(blend, dataset, seed=seed)]
@@ -92,6 +125,9 @@ def _scored_blend(
         after = [h for h in default_horizons(blend) if h < longest]
     if len(after) and (horizons is not None or predicts_any_time(blend)):
         tasks += score_forecast(blend, dataset, after)
+    if calibration is not None:
+        drawn = {s.task: s.calibration for s in tasks if s.calibration is not None}
+        save(calibration_figure(drawn, title=dataset[0].origin), calibration)
     result: dict[str, Any] = {} if evaluation is None else evaluation.to_dict()
     result["tasks"] = [scores.to_dict() for scores in tasks]
     result["gamma"] = {
@@ -115,12 +151,13 @@ def default_horizons(blend: Blend) -> list[float]:
 def overview(tasks: Sequence[ChannelScores]) -> str:
     """A table with a row per task: scaled RMSE of the answer and of the best predictors.
 
+    The interval score is that of 95 %.
+
     Args:
         tasks: scores whose first predictor is the blend.
     """
-    lines = [
-        ["task, scaled RMSE", "blend", "model", "best baseline", "", "in 50, 80, 95 %", "CRPS"]
-    ]
+    head = ["task, scaled RMSE", "blend", "model", "best baseline", "", "in 50, 80, 95 %", "CRPS"]
+    lines = [[*head, "interval score"]]
     for scores in tasks:
         own, *others = scores.rmse
         model = next((name for name in others if name not in scores.trivial), None)
@@ -135,6 +172,7 @@ def overview(tasks: Sequence[ChannelScores]) -> str:
                 who,
                 " ".join(f"{100 * share:.0f}" for share in covered.values()),
                 "-" if scores.crps is None else f"{scores.crps:.3g}",
+                "-" if scores.interval_score is None else f"{scores.interval_score[0.95]:.3g}",
             ]
         )
     return tables.plain(lines, left=(0, 4))
