@@ -3,8 +3,9 @@
     python tests/fuzz.py --mutants 2000 --targets csv ulog
 
 A mutant is made from a target and a number alone, so that an outcome can be repeated. Each ends in
-`read` or `refused`, a line of at most 700 printable characters. Anything else is a fault: another
-exception, a crash, more than 10 s, or more than 1 GB of memory.
+`read` or `refused`, a line of at most 300 printable characters. Anything else is a fault: another
+exception, a crash, more than 10 s, or more than 1 GB of memory. One process reads many mutants; one
+that crashes or hangs is an outcome, and the next process goes on after it.
 """
 
 from __future__ import annotations
@@ -12,12 +13,16 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
+import os
 import resource
+import select
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -38,8 +43,11 @@ from offbeat.stream.lines import LineSession
 from offbeat.stream.stream import Stream
 from offbeat.sweeps.record import Record
 
-SECONDS, MEMORY = 10, 1 << 30
-"""Limits of a mutant."""
+SECONDS, MEMORY, CHARACTERS = 10, 1 << 30, 300
+"""Limits of a mutant: its time, its memory in bytes, its message. Paths do not count."""
+
+ROUND = 5000
+"""Mutants of a target before the next target has its turn."""
 
 STAMPS = 1_700_000_000_123_456_000 + 1000 * np.cumsum(
     np.random.default_rng(0).integers(1000, 30_000, 60)
@@ -238,8 +246,8 @@ def outcome(name: str, number: int, good: Path) -> str:
                 TARGETS[name].use(path)
             said = "read"
         except OffbeatError as error:
-            text = str(error)
-            fine = len(text) <= 700 and "\n" not in text and printable(text) == text
+            text = str(error).replace(str(folder), "")
+            fine = len(text) <= CHARACTERS and "\n" not in text and printable(text) == text
             said = "refused" if fine else f"message: {text[:100]!r}"
         except TimeoutError:
             said = "hang"
@@ -268,45 +276,81 @@ def outcomes(name: str, numbers: range, good: Path) -> Iterator[tuple[int, str]]
         logging.disable(logging.NOTSET)
 
 
-def _in_processes(name: str, count: int, good: Path) -> Iterator[tuple[int, str]]:
-    """As `outcomes`, in a process for each thousand, so that a crash is an outcome."""
-    start = 0
-    while start < count:
-        stop = min(start + 1000, count)
-        command = [sys.executable, __file__, "--work", name, str(good), str(start), str(stop)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
-        yield from ((number, said) for number, said in lines)
-        start = lines[-1][0] + 1 if lines else start
-        if start < stop:
-            yield start, f"crash, exit code {done.returncode}"
+def _in_processes(name: str, numbers: range, good: Path) -> Iterator[tuple[int, str]]:
+    """As `outcomes`, in a process of its own, so that a crash is an outcome, and a hang in C."""
+    start = numbers.start
+    while start < numbers.stop:
+        command = [sys.executable, __file__, "--work", name, str(good), str(start)]
+        process = subprocess.Popen(
+            [*command, str(numbers.stop)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
+        assert process.stdout is not None
+        hangs = False
+        while start < numbers.stop:
+            # the first line comes after the imports
+            hangs = not select.select([process.stdout], [], [], 6 * SECONDS)[0]
+            line = b"" if hangs else process.stdout.readline()
+            if not line:
+                break
+            if line.startswith(b"["):
+                number, said = json.loads(line)
+                start = number + 1
+                yield number, said
+        if start < numbers.stop:
+            process.kill()
+            code = process.wait()
+            if code == 1 and not hangs:
+                raise RuntimeError(f"this fails by itself: {command}")
+            yield start, "hang" if hangs else f"crash, exit code {code}"
             start += 1
+        process.wait()
+
+
+def _work(name: str, numbers: range, good: Path) -> None:
+    """Prints the outcomes, with an address space that ends above the limit of memory."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + 4 * MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    for found in outcomes(name, numbers, good):
+        os.write(1, json.dumps(found).encode() + b"\n")
 
 
 def main() -> int:
     """Runs mutants of all targets; returns 1 if any ends in a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mutants", type=int, default=1000, help="of each target")
+    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this time")
     parser.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
     parser.add_argument("--work", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work:
         name, good, start, stop = options.work
-        for found in outcomes(name, range(int(start), int(stop)), Path(good)):
-            print(json.dumps(found), flush=True)
+        _work(name, range(int(start), int(stop)), Path(good))
         return 0
-    faults = 0
+    classes: dict[str, Counter[str]] = {name: Counter() for name in options.targets}
+    spent: Counter[str] = Counter()
+    began, stop = time.monotonic(), options.first + options.mutants
     with tempfile.TemporaryDirectory() as folder:
-        for name in options.targets:
-            good = prepared(name, Path(folder) / name)
-            classes: Counter[str] = Counter()
-            for number, said in _in_processes(name, options.mutants, good):
-                classes[said if said in ("read", "refused") else "fault"] += 1
-                if said not in ("read", "refused"):
-                    print(f"{name} {number}: {said}")
-            faults += classes["fault"]
-            print(f"{name}: {dict(classes)}", flush=True)
-    return int(faults > 0)
+        good = {name: prepared(name, Path(folder) / name) for name in options.targets}
+        for first in range(options.first, stop, ROUND):
+            for name in options.targets:
+                start = time.monotonic()
+                if start - began > 60 * options.minutes:
+                    continue
+                for number, said in _in_processes(
+                    name, range(first, min(first + ROUND, stop)), good[name]
+                ):
+                    classes[name][said if said in ("read", "refused") else "fault"] += 1
+                    if said not in ("read", "refused"):
+                        print(f"{name} {number}: {said}", flush=True)
+                spent[name] += time.monotonic() - start
+                count = classes[name].total()
+                rate = count / spent[name]
+                print(f"{name}: {count} mutants, {rate:.0f}/s, {dict(classes[name])}", flush=True)
+    every = sum(classes.values(), Counter())
+    print(f"all: {every.total()} mutants, {dict(every)}")
+    return int(every["fault"] > 0)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import itertools
 import unicodedata
 from collections.abc import Iterable
 from types import ModuleType
@@ -53,8 +54,8 @@ class DivergenceError(OffbeatError, ArithmeticError):
     """A computation diverged: a loss is NaN, or a solver exceeded its number of steps."""
 
 
-_MOST_LISTED, _MOST_COMPARED = 50, 2000  # choices in a message
-_LONGEST_SHOWN = 100  # characters of what was given
+_MOST_SHOWN, _MOST_COMPARED = 240, 2000  # characters of a message, choices compared
+_LONGEST_SHOWN = 60  # characters of what was given
 
 
 def require(module: str, extra: str) -> ModuleType:
@@ -80,16 +81,19 @@ def one_of(what: str, got: str, choices: Iterable[str]) -> str:
     """Returns `got` when it is one of `choices`.
 
     Raises:
-        InputError: it is not; the message lists the choices and the nearest one.
+        InputError: it is not; the message lists the choices, as many as fit, and the nearest one.
     """
     known = sorted(choices)
     if isinstance(got, str) and got in known:
         return got
-    near = difflib.get_close_matches(str(got), known[:_MOST_COMPARED], n=1)
+    near = difflib.get_close_matches(str(got)[:1000], known[:_MOST_COMPARED], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    more = f" and {len(known) - _MOST_LISTED} more" if len(known) > _MOST_LISTED else ""
-    shown = ", ".join(known[:_MOST_LISTED]) + more
     given = repr(got)
     if len(given) > _LONGEST_SHOWN:
         given = f"{given[:_LONGEST_SHOWN]}..."
+    room = _MOST_SHOWN - len(what) - len(given) - len(hint)
+    lengths = itertools.accumulate(len(name) + 2 for name in known)
+    listed = sum(1 for _ in itertools.takewhile(lambda length: length <= room, lengths))
+    more = f" and {len(known) - listed} more" if listed < len(known) else ""
+    shown = ", ".join(known[:listed]) + more
     raise InputError(f"unknown {what} {given}, expected one of: {shown}{hint}")
