@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.writers import save as save_as
 
 
 def text_of(value):
@@ -86,6 +87,20 @@ def write_own(path, stamps, values):
     return path.with_suffix(".parquet")
 
 
+def written(format, suffix):
+    """What writes the walk with a writer of ours, on its clock."""
+
+    def write(path, stamps, values):
+        path = path.with_suffix(suffix)
+        times = (np.asarray(stamps) - stamps[0]) / 1e9
+        walk = Trajectory(times, values, names=("hip", "knee"))
+        clock = {"clock_start": [int(stamps[0])], "time_unit": "ns"}
+        save_as(Dataset([walk], clock), path, format=format)
+        return path
+
+    return write
+
+
 WRITERS = {
     "offbeat": write_own,
     "csv": write_csv,
@@ -93,6 +108,7 @@ WRITERS = {
     "parquet": write_parquet,
     "parquet long": write_long_parquet,
     "npz": write_npz,
+    "npz written": written("npz", ".npz"),
     "tum": write_tum,
     "euroc": write_euroc_file,
     "euroc folder": write_euroc_folder,
@@ -108,4 +124,6 @@ except ImportError:
     pass
 else:
     WRITERS |= robot_logs.SAME_WALK
+    WRITERS["hdf5 robomimic written"] = written("robomimic", ".hdf5")
+    WRITERS["hdf5 minari written"] = written("minari", "")
     OPTIONS |= robot_logs.SAME_WALK_OPTIONS

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -76,10 +78,182 @@ def test_unknown_formats_and_names_that_collide_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", sorted(WRITERS))
 def test_every_format_keeps_times_values_names_and_units(tmp_path, name):
-    path = tmp_path / f"walk{WRITERS[name].suffixes[0]}"
+    writer = WRITERS[name]
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
+    path = tmp_path / ("walk" if writer.is_folder else f"walk{writer.suffixes[0]}")
     save(made(), path, format=name)
     again = ob.read(path)
     assert (again.names, again.units) == (made().names, made().units)
     for a, b in zip(again, made(), strict=True):
         assert a.times.tolist() == b.times.tolist()
-        assert np.array_equal(a.values, b.values, equal_nan=True)
+        values = b.values.astype(np.float32) if name == "lerobot" else b.values
+        assert np.array_equal(a.values, values, equal_nan=True)
+
+
+NEEDS = {"robomimic": "h5py", "minari": "h5py"}
+
+
+def walk(rows=(20, 12)) -> ob.Dataset:
+    """Uneven times on a clock, a masked value, a channel that is an action."""
+    random = np.random.default_rng(3)
+    each = []
+    for n in rows:
+        values = random.normal(size=(n, 4)).astype(np.float32).astype(np.float64)
+        observed = random.random((n, 4)) < 0.7
+        each.append(
+            ob.Trajectory(
+                np.cumsum(random.integers(10, 50, n)) / 1000 - 0.01,
+                values,
+                observed=observed,
+                names=("hip", "knee", "foot", "motor"),
+                units=("rad", "rad", "m", "N"),
+                roles=("state", "state", "state", "action"),
+            )
+        )
+    starts = [1_700_000_000_123_456_789 + 10**11 * i for i in range(len(rows))]
+    return ob.Dataset(tuple(each), {"clock_start": starts, "time_unit": "ns", "source": "walk.bag"})
+
+
+def stamps(data) -> list[list[int]]:
+    starts = data.meta["clock_start"]
+    return [
+        [start + round(t * 1e9) for t in one.times.tolist()]
+        for start, one in zip(starts, data, strict=True)
+    ]
+
+
+class TestLeRobot:
+    @pytest.fixture
+    def folder(self, tmp_path):
+        save(walk(), tmp_path / "walk", rate_hz=30, task="walk a step")
+        return tmp_path / "walk"
+
+    def test_its_rows_and_metadata_are_those_of_version_3(self, folder):
+        info = json.loads((folder / "meta" / "info.json").read_text())
+        assert info["codebase_version"] == "v3.0"
+        assert (info["total_episodes"], info["total_frames"], info["fps"]) == (2, 32, 30)
+        table = pq.read_table(folder / "data" / "chunk-000" / "file-000.parquet")
+        assert set(table.column_names) == set(info["features"])
+        assert table["index"].to_pylist() == list(range(32))
+        assert table["frame_index"].to_pylist() == [*range(20), *range(12)]
+        expected = (np.arange(20) / 30).astype(np.float32)
+        assert table["timestamp"].to_numpy()[:20].tolist() == expected.tolist()
+        assert table["complementary_info.time_ns"].to_pylist() == [
+            stamp for each in stamps(walk()) for stamp in each
+        ]
+        state = np.concatenate([t.values[:, :3] for t in walk()])
+        assert np.array_equal(table["observation.state"].to_pylist(), state)
+        masks = np.concatenate([t.observed for t in walk()])
+        assert np.array_equal(table["complementary_info.observed"].to_pylist(), masks)
+        for name, feature in info["features"].items():
+            assert feature["shape"] == [getattr(table.schema.field(name).type, "list_size", 1)]
+
+    def test_its_episodes_say_where_they_are_and_their_statistics(self, folder):
+        path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+        first, second = pq.read_table(path).to_pylist()
+        assert (second["dataset_from_index"], second["dataset_to_index"]) == (20, 32)
+        assert first["tasks"] == ["walk a step"]
+        hip = walk()[1].values[:, 0]
+        assert second["stats/observation.state/mean"][0] == pytest.approx(hip.mean(), abs=1e-12)
+        assert second["stats/observation.state/q90"][0] == pytest.approx(np.quantile(hip, 0.9))
+        whole = json.loads((folder / "meta" / "stats.json").read_text())
+        every = np.concatenate([t.values[:, 0] for t in walk()])
+        assert whole["observation.state"]["std"][0] == pytest.approx(every.std(), abs=1e-12)
+        assert whole["observation.state"]["count"] == [32]
+
+    def test_pandas_reads_its_tasks_by_name_as_lerobot_does(self, folder):
+        pandas = pytest.importorskip("pandas")
+        tasks = pandas.read_parquet(folder / "meta" / "tasks.parquet")
+        assert tasks.loc["walk a step", "task_index"] == 0
+        assert tasks.index.name == "task"
+
+    def test_it_is_read_back_on_the_clock_of_the_log_with_its_action(self, folder):
+        again = ob.read(folder)
+        assert stamps(again) == stamps(walk())
+        assert again.names == ("hip", "knee", "foot", "action.motor")
+        assert again.roles == walk().roles
+        assert np.array_equal(again[0].values, walk()[0].values)
+        save(again, folder, rate_hz=30)  # what is there is replaced
+        assert ob.read(folder).fingerprint() == again.fingerprint()
+
+    def test_a_folder_of_other_files_is_not_replaced(self, tmp_path):
+        (tmp_path / "thesis.tex").write_text("x")
+        for name in ("lerobot", "minari"):
+            with pytest.raises(ob.InputError, match="holds other files"):
+                save(walk(), tmp_path, format=name)
+        assert (tmp_path / "thesis.tex").read_text() == "x"
+
+
+class TestHdf5:
+    @pytest.fixture(autouse=True)
+    def h5py(self):
+        return pytest.importorskip("h5py")
+
+    def test_robomimic_has_a_demonstration_per_trajectory(self, h5py, tmp_path):
+        save(walk(), tmp_path / "walk.hdf5", rate_hz=25)
+        with h5py.File(tmp_path / "walk.hdf5") as file:
+            data = file["data"]
+            said = json.loads(data.attrs["env_args"])
+            assert said["env_kwargs"]["control_freq"] == 25
+            assert (data.attrs["total"], sorted(data)) == (32, ["demo_0", "demo_1"])
+            demo = data["demo_1"]
+            assert np.array_equal(demo["obs/state"], walk()[1].values[:, :3])
+            assert np.array_equal(demo["actions"], walk()[1].values[:, 3:])
+            assert np.array_equal(demo["observed"], walk()[1].observed)
+            assert demo["time_ns"][()].tolist() == stamps(walk())[1]
+            assert demo["dones"][()].tolist() == [0] * 11 + [1]
+            assert demo.attrs["num_samples"] == 12
+
+    def test_minari_has_one_action_less_than_observations(self, h5py, tmp_path):
+        save(walk(), tmp_path / "walk", format="minari")
+        said = json.loads((tmp_path / "walk" / "data" / "metadata.json").read_text())
+        assert (said["total_episodes"], said["total_steps"]) == (2, 30)
+        assert json.loads(said["observation_space"])["shape"] == [3]
+        with h5py.File(tmp_path / "walk" / "data" / "main_data.hdf5") as file:
+            episode = file["episode_0"]
+            assert episode["observations"].shape == (20, 3)
+            assert np.array_equal(episode["actions"], walk()[0].values[:-1, 3:])
+            assert episode["infos/time_ns"][()].tolist() == stamps(walk())[0]
+            assert episode["truncations"][()].tolist() == [False] * 18 + [True]
+
+    def test_minari_itself_reads_its_folder(self, tmp_path):
+        minari = pytest.importorskip("minari")
+        save(walk(), tmp_path / "walk", format="minari")
+        data = minari.MinariDataset(tmp_path / "walk" / "data")
+        first = next(iter(data.iterate_episodes()))
+        assert (data.total_steps, first.observations.shape) == (30, (20, 3))
+
+    @pytest.mark.parametrize("name", ["robomimic", "minari"])
+    def test_both_are_read_back_with_names_units_roles_and_clock(self, tmp_path, name):
+        path = tmp_path / ("walk.hdf5" if name == "robomimic" else "walk")
+        save(walk(), path, format=name)
+        again = ob.read(path)
+        assert (again.names, again.units) == (walk().names, walk().units)
+        assert again.roles == walk().roles
+        assert stamps(again) == stamps(walk())
+
+
+def test_npz_holds_masks_and_is_read_back_without_them(tmp_path):
+    save(walk(), tmp_path / "walk.npz")
+    with np.load(tmp_path / "walk.npz", allow_pickle=False) as file:
+        assert np.array_equal(file["observed"], np.concatenate([t.observed for t in walk()]))
+        assert file["roles"].tolist() == list(walk().roles)
+    again = ob.read(tmp_path / "walk.npz")
+    assert again.names == walk().names
+    assert stamps(again) == stamps(walk())
+    chosen = ob.read(tmp_path / "walk.npz", channels=["observed.1"])
+    assert chosen[0].values[:, 0].tolist() == walk()[0].observed[:, 1].tolist()
+
+
+def test_options_of_a_format_are_checked(tmp_path):
+    with pytest.raises(ob.InputError, match="takes no options, got 'rate_hz'"):
+        save(walk(), tmp_path / "walk.csv", rate_hz=3)
+    with pytest.raises(ob.InputError, match=r"unknown option of the format lerobot 'fps'"):
+        save(walk(), tmp_path / "walk", fps=3)
+    with pytest.raises(ob.InputError, match="rate_hz must be a positive number"):
+        save(walk(), tmp_path / "walk", rate_hz=-3)
+    acted = walk().select(["motor"])
+    with pytest.raises(ob.InputError, match="only actions"):
+        save(acted, tmp_path / "walk")
+    assert not list(tmp_path.iterdir())

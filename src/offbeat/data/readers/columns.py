@@ -85,6 +85,10 @@ class TableOptions:
             raise InputError(f"rate_hz must be rows per second, above 0, got {rate!r}")
 
 
+_BESIDE = ("observed", "low", "high", "beyond")
+"""What columns hold that Offbeat writes beside a channel, as `knee|observed`."""
+
+
 @dataclass(frozen=True)
 class Columns:
     """The meaning of each column of a table.
@@ -205,12 +209,20 @@ class Columns:
             left = [column for column in columns if column not in asked]
         else:
             without = {column_of[name] for name in options.without if name in column_of}
-            texts = [c for c in columns if c not in without and sample.is_text(c)]
-            left = [*without, *texts]
+            beside = _of_answers(columns)
+            texts = [c for c in columns if c not in without | beside and sample.is_text(c)]
+            left = [*without, *beside, *texts]
             gone = set(left)
             kept = [column for column in columns if column not in gone]
+            if beside:
+                notes = (
+                    "masks and intervals of answers are left out unless chosen with channels=",
+                )
             if texts:
-                notes = (f"columns of text are left out: {listed(texts, 6)}",)
+                notes = (
+                    *notes,
+                    f"columns of text are left out: {listed(texts, 6)}",
+                )
             if not kept:
                 raise FileFormatError(
                     f"{path} has no column of numbers besides the time, expected one per channel; "
@@ -359,6 +371,13 @@ def columns_in(given: str | Sequence[str], names: Sequence[str]) -> tuple[str, .
         parts = tuple(part.strip() for part in given.split(","))
         return parts if given not in names and set(parts) <= set(names) else (given,)
     return tuple(part.strip().strip("'\"") for part in given.strip("[]").split(","))
+
+
+def _of_answers(columns: Sequence[str]) -> set[str]:
+    """The columns that Offbeat writes beside those of filled channels, such as `knee|observed`."""
+    known = set(columns)
+    parts = {column: column.rpartition("|") for column in columns}
+    return {c for c, (name, _, what) in parts.items() if name in known and what in _BESIDE}
 
 
 def _named(name: str, columns: list[str], what: str) -> str:

@@ -265,20 +265,23 @@ def _episode(
         stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
     if left:
         notes = (*notes, f"left out: {', '.join(left)}")
-    called = {name: _names(name, values.shape[1]) for name, values in arrays.items()}
+    called = {name: _names(name, values.shape[1], leaves[name]) for name, values in arrays.items()}
+    units = [unit for name, names in called.items() for unit in _units(leaves[name], len(names))]
     kinds = [kind for name, channels in called.items() for kind in _kinds(name, channels)]
     parts = list(arrays.values())
     states = [channel for channels in called.values() for channel in channels]
     acted: list[str] = []
     if actions:
-        values, acted, more = _actions(episode, path, n)
+        values, acted, acted_units, more = _actions(episode, path, n)
         parts += values
+        units += acted_units
         notes = (*notes, *more)
     signal = Signal(
         "",
         stamps,
         np.hstack(parts),
         (*states, *acted),
+        units=tuple(units),
         kinds=(*kinds, *[""] * len(acted)),
         roles=("state",) * len(states) + ("action",) * len(acted),
     )
@@ -302,8 +305,9 @@ def _times(
 
     beside = {
         name: array
-        for name in episode
-        if isinstance(array := _member(episode, name, path), h5py.Dataset)
+        for group in (episode, episode.get("infos", ()))
+        for name in (group if isinstance(group, h5py.Group) else ())
+        if isinstance(array := _member(group, name, path), h5py.Dataset)
     }
     known = {**beside, **leaves}
     if given is not None:
@@ -421,10 +425,29 @@ def _what(dataset: Any) -> str:
     return str(dataset.dtype) if dataset.ndim else "one number"
 
 
-def _names(name: str, width: int) -> list[str]:
+def _names(name: str, width: int, array: Any) -> list[str]:
+    """The names of an array's columns: those in its attribute `names`, else numbers."""
+    given = _attribute(array, "names", width)
+    if given is not None and len(set(given)) == width and all(given):
+        return given
     if not name:  # all observations are one array
         return [f"observation[{i}]" for i in range(width)]
     return [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
+
+
+def _units(array: Any, width: int) -> list[str]:
+    """The units of an array's columns, in its attribute `units`; else empty."""
+    return _attribute(array, "units", width) or [""] * width
+
+
+def _attribute(array: Any, name: str, width: int) -> list[str] | None:
+    """A text per column in an attribute, or None."""
+    try:
+        found = np.asarray(array.attrs[name]).reshape(-1)
+    except (KeyError, OSError, TypeError, ValueError):
+        return None
+    texts = [text.decode(errors="replace") if isinstance(text, bytes) else text for text in found]
+    return texts if len(texts) == width and all(isinstance(t, str) for t in texts) else None
 
 
 def _kinds(name: str, channels: list[str]) -> list[str]:
@@ -434,21 +457,24 @@ def _kinds(name: str, channels: list[str]) -> list[str]:
 
 def _actions(
     episode: Any, path: Path, rows: int
-) -> tuple[list[NDArray[np.float64]], list[str], tuple[str, ...]]:
-    """Values and names of the actions, one per row of the observations, and notes."""
+) -> tuple[list[NDArray[np.float64]], list[str], list[str], tuple[str, ...]]:
+    """Values, names and units of the actions, one per row of the observations, and notes."""
     if "actions" not in episode:
-        return [], [], ("there are no actions",)
+        return [], [], [], ("there are no actions",)
     parts: list[NDArray[np.float64]] = []
     channels: list[str] = []
+    units: list[str] = []
     for name, dataset in _leaves(_member(episode, "actions", path), "", path):
         _refuse_objects(dataset, path)
         _check_storage(dataset, path)
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
-            return [], [], (f"actions are left out, they hold {_what(dataset)}",)
+            return [], [], [], (f"actions are left out, they hold {_what(dataset)}",)
         values = np.asarray(dataset[()], dtype=np.float64)
         parts.append(values.reshape(len(values), math.prod(values.shape[1:])))
-        start = f"action.{name}" if name else "action"
-        channels += [f"{start}[{i}]" for i in range(parts[-1].shape[1])]
+        start, width = f"action.{name}" if name else "action", parts[-1].shape[1]
+        given = _attribute(dataset, "names", width)
+        channels += given or [f"{start}[{i}]" for i in range(width)]
+        units += _units(dataset, width)
     if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (rows, rows - 1):
         raise FileFormatError(
             f"{path}: {episode.name} has {[len(part) for part in parts]} actions for {rows} "
@@ -456,6 +482,11 @@ def _actions(
             "include_actions=False"
         )
     if len(parts[0]) == rows or rows == 1:
-        return parts if len(parts[0]) else [], channels if len(parts[0]) else [], ()
+        return (parts, channels, units, ()) if len(parts[0]) else ([], [], [], ())
     last = [np.vstack([part, part[-1:]]) for part in parts]
-    return last, channels, ("the last observation has no action; that of the row before is used",)
+    return (
+        last,
+        channels,
+        units,
+        ("the last observation has no action; that of the row before is used",),
+    )

@@ -166,6 +166,11 @@ class _Reading:
             stamps,
             _matrix(episode, features, at.file),
             tuple(name for names in named for name in names),
+            tuple(
+                unit
+                for f in features
+                for unit in (f.units if len(f.units) == f.width else ("",) * f.width)
+            ),
             roles=tuple(f.role for f, names in zip(features, named, strict=True) for _ in names),
         )
         return Recording(

@@ -33,6 +33,7 @@ class Feature:
     dtype: str
     shape: tuple[int, ...]
     labels: tuple[str, ...]
+    units: tuple[str, ...] = ()
 
     @property
     def width(self) -> int:
@@ -96,7 +97,8 @@ class Info:
                     name,
                     str(feature["dtype"]),
                     tuple(int(n) for n in feature.get("shape") or (1,)),
-                    _labels(feature),
+                    _labels(name, feature),
+                    tuple(map(str, feature.get("units") or ())),
                 )
                 for name, feature in found["features"].items()
             }
@@ -236,7 +238,7 @@ def _check_pattern(pattern: str, path: Path) -> None:
         )
 
 
-def _labels(feature: dict[str, Any]) -> tuple[str, ...]:
+def _labels(feature_name: str, feature: dict[str, Any]) -> tuple[str, ...]:
     """One unique name per number, or none if `names` is something else, such as axes."""
     names = feature.get("names")
     if isinstance(names, dict):  # {"motors": [...]}; in others, a name and its position
@@ -247,8 +249,10 @@ def _labels(feature: dict[str, Any]) -> tuple[str, ...]:
     if isinstance(names, list) and names and all(isinstance(part, list) for part in names):
         names = [name for part in names for name in part]
     width = math.prod(int(n) for n in feature.get("shape") or (1,))
-    if not isinstance(names, list) or len(names) != width or width == 1:
+    if not isinstance(names, list) or len(names) != width:
         return ()
+    if width == 1 and feature_name not in ("observation.state", "action"):
+        return ()  # the feature itself has the name
     labels = [str(name) for name in names]
     return tuple(
         label if labels.count(label) == 1 else f"{label}[{labels[:i].count(label)}]"

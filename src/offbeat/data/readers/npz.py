@@ -24,6 +24,7 @@ from offbeat.errors import FileFormatError, one_of
 
 _NAMES = ("names", "channels", "columns")
 _SPECIAL = (*_NAMES, "units")
+_BESIDE = ("roles", "observed", "low", "high", "clock_ns")  # what Offbeat writes beside values
 _SAMPLE = 1000
 _MOST_ARRAYS = 10_000
 
@@ -73,6 +74,10 @@ def read_npz(
     path = require_file(path)
     _check_size(path)
     arrays = _load(path)
+    written = {"values", "observed", "names"} <= arrays.keys()  # by Offbeat
+    if written and "clock_ns" in arrays and time_column is None:
+        arrays["time_ns"] = arrays.pop("clock_ns")  # exact, while `time` counts from the first row
+        arrays.pop("time", None)
     options = TableOptions(
         time_column=time_column,
         trajectory_column=trajectory_column,
@@ -91,7 +96,10 @@ def read_npz(
             "expected numbers of shape (rows,) or (episodes, rows)"
         )
     clock, unit, notes, found = _clock(path, arrays, stamp, shape, options, time_unit)
-    table, stated, left = _table(arrays, shape, {stamp.time, stamp.rest})
+    beside = [name for name in _BESIDE if written and name in arrays and channels is None]
+    rest = {name: array for name, array in arrays.items() if name not in beside}
+    table, stated, left = _table(rest, shape, {stamp.time, stamp.rest})
+    left += beside
     if not any(array.dtype.kind in "biuf" for array in table.values()):
         shapes = ", ".join(f"{name!r} {array.shape}" for name, array in arrays.items()
                            if name != stamp.time) or "nothing"  # fmt: skip
@@ -99,7 +107,9 @@ def read_npz(
             f"{path} has no array with a row for each of the {shape} times in {stamp.time!r}, "
             f"besides them it has {shapes}"
         )
-    if left:
+    if beside:
+        notes = (*notes, "masks and intervals are left out")
+    elif left:
         notes = (*notes, f"arrays without a row per time are left out: {', '.join(left[:20])}")
     if len(table) > MOST_CHANNELS:
         raise FileFormatError(f"{path} has {len(table)} columns, more than {MOST_CHANNELS}")
