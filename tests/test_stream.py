@@ -23,6 +23,7 @@ from offbeat import (
     Stream,
     StreamOptions,
     Trajectory,
+    kernels,
     predict,
 )
 from offbeat.models.zoo import ZOO
@@ -162,15 +163,54 @@ def test_a_stream_starts_again_after_a_reset() -> None:
     assert not np.array_equal(streamed(other, one), first), "other generator"
 
 
-def test_a_state_that_left_the_finite_numbers_says_so() -> None:
+@pytest.mark.parametrize("engine", ["compiled", "reference"])
+@pytest.mark.parametrize("predicts", ["the next row", "a time"])
+def test_a_state_that_left_the_finite_numbers_is_reset_and_counted(
+    predicts: str, engine: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Every valid message is answered, and the first one after a reset as that of a new stream."""
     model = small_model("ode_rnn", activation="silu", std=30.0, dtype=FLOAT32, bounded=False)
-    stream = Stream(model)
-    with pytest.raises(DivergenceError):  # noqa: PT012
+    recovered = 0
+    with kernels.use("reference" if engine == "reference" else "auto"):
+        stream, new = Stream(model), Stream(model)
         for row in range(60):
-            stream.observe(0.03 * row, [1.0, -1.0, 1.0])
-            stream.predict(0.03 * row + 0.01)
-    stream.reset()
-    assert np.isfinite(stream.predict(0.0)).all()
+            t, values = 0.03 * row, [1.0, -1.0, 1.0]
+            if predicts == "a time":
+                assert stream.observe(t, values) == "new"
+                got, expected = stream.predict(t), new.predict(0.0)
+            else:
+                outcome, got = stream.step(t, values)
+                assert outcome == "new"
+                expected = new.predict(0.0)
+            assert np.isfinite(got).all()
+            if stream.recoveries > recovered:
+                recovered = stream.recoveries
+                assert np.array_equal(got, expected)
+    assert stream.counters.rows == 60
+    assert 0 < recovered == stream.counters.recoveries < 60
+    assert [record for record in caplog.records if "was reset" in record.message]
+    assert len(caplog.records) == 1, "it is said once"
+
+
+def test_a_row_at_which_an_adaptive_solver_gives_up_is_the_first_of_a_reset_state() -> None:
+    model = small_model("ode_rnn", dtype=FLOAT32)
+    stream, new = Stream(model), Stream(model)
+    observe, times = stream._engine.observe, []
+
+    def gives_up(time: float, *row: Any) -> None:
+        times.append(time)
+        if time == 2.0 and times.count(2.0) == 1:
+            raise DivergenceError("no step is small enough")
+        observe(time, *row)
+
+    stream._engine.observe = gives_up  # type: ignore[method-assign]
+    for row in range(4):
+        assert stream.observe(float(row), [1.0, -1.0, 1.0]) == "new"
+    for row in (2, 3):
+        new.observe(float(row), [1.0, -1.0, 1.0])
+    assert np.array_equal(stream.predict(3.5), new.predict(3.5))
+    assert stream.counters.recoveries == 1
+    assert stream.counters.rows == 4
 
 
 @pytest.mark.parametrize("name", ["gru_d", "ode_rnn", "anchored_ode_gru_d"])

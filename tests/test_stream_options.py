@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stream_helpers import NAMES, Recorded
 
-from offbeat import InputError
+from offbeat import DivergenceError, InputError
 
 
 def said(stream: Recorded, *messages: tuple[float, dict[str, float]]) -> list[str]:
@@ -353,8 +353,14 @@ def test_after_a_gap_that_reset_the_state_older_messages_do_not_come_back() -> N
     assert stream.rows == [(4.5, (None, 1.0, None)), (5.0, (2.0, None, None))]
 
 
-def test_every_outcome_and_every_counter_is_met_by_these_tests() -> None:
+def test_every_outcome_and_every_counter_is_met_by_these_tests(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """One stream that meets all of them, so that none is dead."""
+
+    def gives_up(*_: Any) -> None:
+        raise DivergenceError("no step is small enough")
+
     stream = Recorded(late="reorder", reorder_rows=2, jump_ahead_s=60.0, confirm=2,
                       stale_after_s=5.0)  # fmt: skip
     nan, inf = float("nan"), float("inf")
@@ -366,6 +372,10 @@ def test_every_outcome_and_every_counter_is_met_by_these_tests() -> None:
         (1.0, [1, 1, 1], None), (1.1, [1, 1, 1], None),
     ]  # fmt: skip
     outcomes = {stream.observe(t, values, now=now) for t, values, now in steps}
+    with monkeypatch.context() as once:
+        once.setattr(stream.recorder, "observe", gives_up)
+        with pytest.raises(DivergenceError, match="no step is small enough"):
+            stream.observe(1.2, [1, 1, 1])
     stream.observe(70.0, [1, 1, 1])
     stream.predict(70.0)
     assert outcomes == {"new", "merged", "duplicate", "reordered", "late", "stale", "pending",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.errors import InputError
+from offbeat.errors import DivergenceError, InputError
 from offbeat.stream.engine import Engine, decode, decode_all, encode, encode_all
 
 
@@ -35,10 +36,11 @@ class History:
     Args:
         engine: runs the model.
         kept: number of newest rows that are kept.
+        recover: resets the engine, after a row at which it diverged; the row is then its first.
     """
 
-    def __init__(self, engine: Engine, kept: int) -> None:
-        self._engine, self._kept = engine, kept
+    def __init__(self, engine: Engine, kept: int, recover: Callable[[], None]) -> None:
+        self._engine, self._kept, self._recover = engine, kept, recover
         # The kept rows, the same number while they are replaced, one more, and one to restore.
         self._undo = 2 * kept + 1
         engine.reserve(self._undo + 1)
@@ -60,7 +62,7 @@ class History:
         """Appends the next row. If the engine raises, nothing changes."""
         slot = self._free[-1]
         self._engine.save(slot)
-        self._engine.observe(time, values, mask)
+        self._observe(time, values, mask)
         self._free.pop()
         self.rows.append(Row(time, values, mask, slot))
         if len(self.rows) > self._kept:
@@ -142,13 +144,20 @@ class History:
             for time, values, mask in again:
                 slot = free.pop()
                 self._engine.save(slot)
-                self._engine.observe(time, values, mask)
+                self._observe(time, values, mask)
                 made.append(Row(time, values, mask, slot))
         except Exception:
             self._engine.load(self._undo)
             raise
         self._free = free + [old.slot for old in self.rows[i:]]
         self.rows[i:] = made
+
+    def _observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
+        try:
+            self._engine.observe(time, values, mask)
+        except DivergenceError:
+            self._recover()
+            self._engine.observe(time, values, mask)
 
     def _trim(self) -> None:
         while len(self.rows) > self._kept:

@@ -24,6 +24,7 @@ class LineSession:
     prediction that was made for it before its values were used: one step ahead. With a horizon, it
     is answered with the prediction `horizon_s` after the newest row. Where the model is a blend,
     predictions at a time have `low` and `high` beside them, the ends of their interval of 90 %.
+    Where the state left the finite numbers and was reset, the answer has `"recovered": true`.
 
     Args:
         stream: takes the observations.
@@ -69,7 +70,10 @@ class LineSession:
             raise InputError(f"a line must be a JSON object, got {type(message).__name__}")
         keys = message.keys()
         if {"t", "values"} <= keys <= {"t", "values", "now"}:
-            return self._observe(message)
+            before = self.stream.recoveries
+            answer = self._observe(message)
+            recovered = self.stream.recoveries > before
+            return {**answer, "recovered": True} if recovered else answer
         if keys == {"predict"}:
             t = message["predict"]
             return {"predict": t, **self._predicted(t)}

@@ -105,6 +105,11 @@ class LiveStream:
         return replace(self._placing.counters)
 
     @property
+    def recoveries(self) -> int:
+        """Number of times the state was no longer finite and was reset."""
+        return self._placing.counters.recoveries
+
+    @property
     def pending(self) -> int:
         """Number of messages that wait until it is clear whether the clock jumped."""
         return len(self._placing.pending)
@@ -124,8 +129,8 @@ class LiveStream:
         Raises:
             InputError: a time that is not a finite number, an unknown channel, a value that is not
                 a number, or what the options call an error. The stream has not changed then.
-            DivergenceError: an adaptive solver could not reach its tolerance. The stream has not
-                changed then.
+            DivergenceError: an adaptive solver could not reach its tolerance, not even from a reset
+                state.
         """
         t = self._clock.read(t)
         row, mask, measured, not_finite = self._reader.read(values)
@@ -161,7 +166,7 @@ class LiveStream:
         predicted: list[NDArray[np.float64]] = []
 
         def before_row(time: float) -> None:
-            predicted.append(self._predict(np.array([time]))[0])
+            predicted.append(self._predict(np.array([time]), next_row=True)[0])
 
         self._placing.before_row = before_row
         try:
@@ -175,7 +180,8 @@ class LiveStream:
 
         This is the prediction of the batch pass for a row at this time, if it is the next one.
         At the time of the newest row, the values of that row are known already. Several times are
-        independent: each is predicted as if it were the only one.
+        independent: each is predicted as if it were the only one. A state that is no longer finite
+        is reset, and counted in `recoveries`.
 
         Args:
             t: in the unit of the stream, not before the newest row; or an array of times.
@@ -185,7 +191,7 @@ class LiveStream:
 
         Raises:
             InputError: a time that is not a finite number, or is before the newest row.
-            DivergenceError: the state is no longer finite; `reset` the stream.
+            DivergenceError: the prediction is not finite, although the state is.
         """
         if isinstance(t, np.ndarray) and t.ndim == 0:
             t = t[()]
@@ -267,11 +273,27 @@ class LiveStream:
                 raise InputError(f"the record is of {key} {got!r}, not {expected!r}; {fix}")
         self._placing.restore(record)
 
-    def _predict(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(times, channels) in original units."""
+    def _predict(
+        self, times: NDArray[np.float64], *, next_row: bool = False
+    ) -> NDArray[np.float64]:
+        """(times, channels) in original units.
+
+        Args:
+            times: s.
+            next_row: whether the row of that time is observed next; the state has to go on there.
+        """
         predicted = self._engine.predict(times)
         if not np.isfinite(predicted).all():
-            raise DivergenceError("the state is no longer finite; reset the stream")
+            newest = [self._history.newest] if self._history.rows else []
+            if not next_row and np.isfinite(self._engine.predict(np.array(newest))).all():
+                raise DivergenceError(
+                    "a prediction is not finite, although the state of the stream is; ask for an "
+                    "earlier time, or train the model with a lower learning rate"
+                )
+            self._placing.recover()
+            predicted = self._engine.predict(times)
+        if not np.isfinite(predicted).all():
+            raise DivergenceError("the model predicts no finite numbers from its first state")
         self._placing.counters.predictions += len(times)
         predicted = self._scaler.original(predicted)
         predicted[:, self._exogenous] = np.nan

@@ -125,6 +125,8 @@ class StreamCounters:
         longest_gap_s: s, the longest time without a value.
         resets: times the state was reset, for any reason.
         predictions: times predicted at.
+        recoveries: times the state was no longer finite, or a solver could not go on from it, and
+            was reset.
     """
 
     messages: int = 0
@@ -143,6 +145,7 @@ class StreamCounters:
     longest_gap_s: float = 0.0
     resets: int = 0
     predictions: int = 0
+    recoveries: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -52,7 +53,10 @@ class Placement:
         elapsed_limit: float,
     ) -> None:
         self._engine, self._options, self._names = engine, options, names
-        self.clock, self.history = Clock(time_unit), History(engine, options.kept_rows)
+        self.clock, self.history = (
+            Clock(time_unit),
+            History(engine, options.kept_rows, self.recover),
+        )
         self.counters = StreamCounters()
         self.pending: list[Message] = []
         self.seen: float | None = None
@@ -82,6 +86,17 @@ class Placement:
         self.clock.origin = None
         self.pending, self.seen = [], None
         self.counters.resets += 1
+
+    def recover(self) -> None:
+        """Resets the engine alone, whose state is no longer finite; time and rows stay."""
+        self._engine.reset()
+        self.counters.recoveries += 1
+        if self.counters.recoveries == 1:
+            logging.getLogger("offbeat").warning(
+                "the state of the stream left the finite numbers at the time %s; it was reset and "
+                "starts again from what comes next (counted as recoveries)",
+                self.time,
+            )
 
     def drop(self, outcome: Outcome) -> Outcome:
         """Counts a message that is dropped."""

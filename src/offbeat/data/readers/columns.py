@@ -6,6 +6,7 @@ channel, value), and holds one recording or, by a column of labels, several.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -465,6 +466,16 @@ def _instance_column(
 
 
 def listed(names: Sequence[str], most: int = 20) -> str:
-    """Names in quotes, for messages; of many names, the first ones and the number of the rest."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(map(repr, names[:most])) + more
+    """Names in quotes, for messages.
+
+    Of many or long names, the first ones are given, and the number of the rest.
+    """
+    shown = [f"{name[:36]}..." if len(name) > 40 else name for name in names[:most]]
+    lengths = itertools.accumulate(len(repr(name)) + 2 for name in shown)
+    fit = max(sum(1 for _ in itertools.takewhile(lambda n: n <= _LONGEST_LIST, lengths)), 1)
+    more = f" and {len(names) - fit} more" if len(names) > fit else ""
+    return ", ".join(map(repr, shown[:fit])) + more
+
+
+_LONGEST_LIST = 160
+"""Characters of names in a message."""
