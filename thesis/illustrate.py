@@ -74,7 +74,7 @@ def illustrate(
 
     Raises:
         InputError: an argument is out of bounds, or a model has other channels.
-        MissingExtraError: mujoco or dm_control is not installed. Without umap-learn there is no
+        MissingExtraError: mujoco is not installed. Without umap-learn there is no
             map, and `missing` says so.
     """
     if every < 1 or trajectories < 1:

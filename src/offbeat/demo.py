@@ -172,7 +172,7 @@ def run_demo(
 
     Raises:
         InputError: an argument is out of bounds, or `out` holds a demo with other settings.
-        MissingExtraError: mujoco or dm_control is not installed.
+        MissingExtraError: mujoco is not installed.
     """
     started = time.perf_counter()
     out = Path(out)

@@ -29,7 +29,7 @@ def frames_figure(illustrations: Illustrations, *, trajectory: int = 0, frames: 
         frames: how many.
 
     Raises:
-        MissingExtraError: mujoco or dm_control is not installed, or nothing can render here.
+        MissingExtraError: mujoco is not installed, or nothing can render here.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure

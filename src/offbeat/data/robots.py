@@ -1,12 +1,11 @@
 """Robots for simulation: MuJoCo models with a distribution of initial states.
 
-The built-in ones are models of the DeepMind Control Suite. Their files come with the `dm_control`
-package, which is not imported, because that takes seconds and selects a rendering backend.
+The built-in ones move exactly as those of the DeepMind Control Suite (Tassa et al. 2018,
+arXiv:1801.00690) in the same version of MuJoCo; their files are our own, so that package is not needed.
 """
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, InputError, MissingExtraError, require
+from offbeat.errors import FileFormatError, InputError, require
 from offbeat.registry import Registry
 
 Draw = Callable[[np.random.RandomState, Any, int], NDArray[np.float64]]
@@ -118,7 +117,7 @@ def load_model(robot: str | Path | Robot) -> Any:
     Raises:
         InputError: the robot is unknown.
         FileFormatError: the file is missing or not MJCF.
-        MissingExtraError: mujoco or dm_control is not installed.
+        MissingExtraError: mujoco is not installed.
     """
     source = robot_of(robot).model
     mujoco = require("mujoco", "sim")
@@ -171,46 +170,18 @@ def inside_joint_ranges(speed: float) -> Draw:
     return draw
 
 
-def _suite_model(xml: str) -> Callable[[], Any]:
-    """Compiles a model of the DeepMind Control Suite."""
-
-    def model() -> Any:
-        suite = _suite_folder()
-        try:
-            text = (suite / xml).read_text(encoding="utf-8")
-            # The suite's models include these by exactly these names.
-            common = sorted((suite / "common").glob("*.xml"))
-            assets = {f"./common/{file.name}": file.read_bytes() for file in common}
-        except OSError as error:
-            raise MissingExtraError(
-                f"the installed dm_control lacks {xml} ({error}); reinstall it with: "
-                "pip install --force-reinstall dm_control"
-            ) from None
-        return require("mujoco", "sim").MjModel.from_xml_string(text, assets)
-
-    return model
-
-
-def _suite_folder() -> Path:
-    spec = importlib.util.find_spec("dm_control")
-    if spec is None or not spec.submodule_search_locations:
-        raise MissingExtraError(
-            "this needs the model files of 'dm_control', which is not installed; "
-            "install it with: pip install 'offbeat[sim]'"
-        )
-    return Path(spec.submodule_search_locations[0]) / "suite"
-
+_MJCF = Path(__file__).parent / "mjcf"
 
 register_robot(
     "hopper",
-    _suite_model("hopper.xml"),
+    _MJCF / "hopper.xml",
     # The draw of the thesis: qpos[0:2], qpos[2:7], qvel; joint ranges are not respected.
     draw=_box((2, 0.0, 0.5), (5, -2.0, 2.0), (7, -5.0, 5.0)),
     description="a planar one-legged hopper: 7 joints, 14 channels, 5 ms",
 )
 register_robot(
     "walker",
-    _suite_model("walker.xml"),
+    _MJCF / "walker.xml",
     draw=inside_joint_ranges(5.0),
     description="a planar two-legged walker: 9 joints, 18 channels, 2.5 ms",
 )

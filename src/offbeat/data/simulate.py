@@ -60,7 +60,7 @@ def simulate(
     Raises:
         InputError: the robot is unknown, or an argument is out of bounds.
         FileFormatError: the MJCF file is missing or cannot be compiled.
-        MissingExtraError: mujoco or dm_control is not installed.
+        MissingExtraError: mujoco is not installed.
         DivergenceError: a simulation became unstable.
     """
     entry = robot_of(robot)
@@ -283,7 +283,7 @@ def _versions() -> dict[str, str]:
     from offbeat import __version__  # the package imports this module
 
     versions = {"offbeat": __version__}
-    for name in ("mujoco", "dm_control", "numpy"):
+    for name in ("mujoco", "numpy"):
         with suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     return versions

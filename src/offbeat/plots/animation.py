@@ -66,7 +66,7 @@ def side_by_side(
 
     Raises:
         InputError: shapes disagree, values are not finite, or frames would be too short to show.
-        MissingExtraError: mujoco or dm_control is not installed, or no rendering backend works.
+        MissingExtraError: mujoco is not installed, or no rendering backend works.
     """
     model = load_model(robot)
     truth = _positions("truth_qpos", truth_qpos, model.nq)
@@ -101,7 +101,7 @@ def stills(robot: str, qpos: ArrayLike) -> NDArray[np.uint8]:
 
     Raises:
         InputError: `qpos` is not finite or of another shape.
-        MissingExtraError: mujoco or dm_control is not installed, or no rendering backend works.
+        MissingExtraError: mujoco is not installed, or no rendering backend works.
     """
     positions = _positions("qpos", qpos, load_model(robot).nq)
     return _render_any(robot, positions, positions)[:, 0]
