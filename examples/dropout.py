@@ -2,10 +2,10 @@
 
     python examples/dropout.py LOG dropout.gif --show knee,hip --drop knee,hip
 
-trains on the log as `offbeat train LOG OUT` does. Of the part that nothing was fitted to, the picture
-shows the stretch in which the shown channels move most, with those hidden whose names contain a word
-of `--drop`. While they are out, answers use what was observed before each row alone; when they are
-back, fills from both sides are drawn. Bands are intervals of 90 %.
+trains on the log as `offbeat train LOG OUT` does. Of the part that nothing was fitted to, the
+picture shows the stretch in which the shown channels move most, with those hidden whose names
+contain a word of `--drop`. While they are out, answers use what was observed before each row alone;
+when they are back, fills from both sides are drawn. Bands are intervals of 90 %.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def liveliest(test: ob.Dataset, shown: list[str], seconds: float) -> ob.Trajecto
         middle = slice(t.rows // 3, 2 * t.rows // 3)
         return float(np.nansum(np.abs(np.diff(t.values[middle][:, at], axis=0)) / scale))
 
-    whole = [t for t in cuts if t.times[-1] - t.times[0] > 0.9 * seconds]
+    longest = max(t.times[-1] - t.times[0] for t in cuts)
+    whole = [t for t in cuts if t.times[-1] - t.times[0] > 0.9 * longest]
     return max(whole, key=travelled)
 
 

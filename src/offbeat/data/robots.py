@@ -1,7 +1,7 @@
 """Robots for simulation: MuJoCo models with a distribution of initial states.
 
 The built-in ones move exactly as those of the DeepMind Control Suite (Tassa et al. 2018,
-arXiv:1801.00690) in the same version of MuJoCo; their files are our own, so that package is not needed.
+arXiv:1801.00690) in the same version of MuJoCo. Their files are our own: the suite is not needed.
 """
 
 from __future__ import annotations
