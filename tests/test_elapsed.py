@@ -16,7 +16,8 @@ from offbeat import Batch, Trajectory
 from offbeat.models.elapsed import ElapsedTimes, RecurrentState, elapsed_times
 
 FAR = 1e6
-NAMES = [field.name for field in fields(ElapsedTimes)]
+NAMES = [field.name for field in fields(ElapsedTimes) if field.name != "rows"]
+NAMES += ["delta", "delta_before", "delta_observed", "last"]
 MEAN = torch.tensor([50.0, 60.0, 70.0], dtype=torch.float64)
 
 

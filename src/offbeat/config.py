@@ -250,6 +250,39 @@ class SplitConfig:
         }
 
 
+REDRAWN = ("rows", "values")
+"""Ways of masking that can be drawn anew in each epoch."""
+
+
+@dataclass(frozen=True)
+class RedrawConfig:
+    """How windows and masks are drawn anew in each epoch; see `offbeat.data.redraw.redraw`.
+
+    Attributes:
+        observed_fractions: fractions that stay observed; each trajectory of each epoch has one of
+            them, drawn with equal probability.
+        window: rows of a window of each trajectory, its start drawn; None keeps them whole.
+        mask: `rows`, all states together; `values`, each state on its own.
+    """
+
+    observed_fractions: tuple[float, ...]
+    window: int | None = None
+    mask: Literal["rows", "values"] = "rows"
+
+    def __post_init__(self) -> None:
+        given = self.observed_fractions
+        if isinstance(given, list):  # from JSON and YAML
+            object.__setattr__(self, "observed_fractions", tuple(given))
+        _check(
+            self,
+            "observed_fractions",
+            lambda v: isinstance(v, tuple | list) and len(v) and all(0 < each <= 1 for each in v),
+            "a list of fractions, each above 0 and at most 1",
+        )
+        _check(self, "window", lambda v: isinstance(v, int) and v >= 2, "an integer of at least 2")
+        one_of("mask that is drawn anew", self.mask, REDRAWN)
+
+
 LOSSES = ("head", "relative")
 """Losses of `TrainConfig.loss`."""
 
@@ -314,6 +347,9 @@ class TrainConfig:
         tasks: train on tasks that are drawn anew from the trajectories in each epoch, and validate
             on a fixed set of them; None trains on the trajectories and their masks as they are.
         tasks_per_epoch: number of tasks of an epoch.
+        redraw: train on windows and masks that are drawn anew in each epoch, from whole
+            trajectories; validation stays as it is given. None keeps the windows and masks of the
+            training set.
         loss: `head`, that of the model's head in scaled units; or `relative`, errors in units of
             those of the best baseline for the channel and the time since its last observation.
             With it, or with tasks, `patience` and `keep` go by the validation score, the mean
@@ -333,11 +369,18 @@ class TrainConfig:
     checkpoint_every: int | None = None
     tasks: TaskConfig | None = None
     tasks_per_epoch: int | None = None
+    redraw: RedrawConfig | None = None
     loss: Literal["head", "relative"] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.tasks, dict):  # from JSON and YAML
             object.__setattr__(self, "tasks", from_mapping(TaskConfig, self.tasks))
+        if isinstance(self.redraw, dict):
+            object.__setattr__(self, "redraw", from_mapping(RedrawConfig, self.redraw))
+        if self.tasks is not None and self.redraw is not None:
+            raise InputError(
+                "tasks and redraw both say what an epoch consists of; give one of the two"
+            )
         for name, choices in (
             ("optimizer", ("adamax", "adam", "adamw", "sgd")),
             ("schedule", ("constant", "cosine")),
@@ -372,6 +415,7 @@ class Recipe:
         checkpoint_every: steps; None writes a checkpoint per epoch.
         tasks: how tasks are drawn; None trains on the trajectories as they are.
         tasks_per_epoch: number of tasks.
+        redraw: how windows and masks are drawn; None keeps those of the training set.
         loss: `head` or `relative`.
     """
 
@@ -388,6 +432,7 @@ class Recipe:
     checkpoint_every: int | None = None
     tasks: TaskConfig | None = None
     tasks_per_epoch: int = 1024
+    redraw: RedrawConfig | None = None
     loss: str = "head"
 
     @property

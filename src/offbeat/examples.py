@@ -15,8 +15,9 @@ from torch.nn.functional import huber_loss
 
 from offbeat.baselines import AgeBins, Baseline, fit_baseline
 from offbeat.baselines.errors import CLIPPED, ErrorTable, cells
-from offbeat.config import Recipe, TaskConfig
+from offbeat.config import Recipe, RedrawConfig, TaskConfig
 from offbeat.data.batch import Batch
+from offbeat.data.redraw import Redrawn, redraw
 from offbeat.data.tasks import draw_tasks
 from offbeat.data.trajectory import Dataset
 from offbeat.metrics import Scores, ScoreSums
@@ -116,8 +117,16 @@ def reference_tasks(train: Dataset, recipe: Recipe) -> tuple[Dataset, Dataset]:
 
     Args:
         train: the training set, `ordered`.
-        recipe: with the tasks; without any, the trajectories are both.
+        recipe: with the tasks, or the windows and masks to draw; with neither, the trajectories
+            are both.
     """
+    if recipe.redraw is not None:
+        some, whole = _some(train)
+        first, second = (
+            redraw(whole, recipe.redraw, seed=[recipe.seed, stream]).dataset(some)
+            for stream in (_FITTED, _MEASURED)
+        )
+        return first, second
     if recipe.tasks is None:
         return train, train
     fitted, measured = (
@@ -130,6 +139,31 @@ def reference_tasks(train: Dataset, recipe: Recipe) -> tuple[Dataset, Dataset]:
         for stream in (_FITTED, _MEASURED)
     )
     return fitted, measured
+
+
+def _some(train: Dataset) -> tuple[Dataset, Batch]:
+    """At most `REFERENCE_TASKS` trajectories, spread evenly over a data set."""
+    count = min(len(train), REFERENCE_TASKS)
+    some = train.take(np.linspace(0, len(train) - 1, count).astype(np.int64))
+    return some, Batch.of(some)
+
+
+def longest_silence(train: Dataset, config: RedrawConfig, *, seed: int) -> float:
+    """s, the longest time since the last observed row in some windows and masks of a training.
+
+    Args:
+        train: the training set, `ordered`.
+        config: how they are drawn.
+        seed: of the training.
+    """
+    some, whole = _some(train)
+    drawn = redraw(whole, config, seed=[seed, _MEASURED]).dataset(some)
+    silence = 0.0
+    for trajectory in drawn:
+        seen = np.flatnonzero(trajectory.observed.any(axis=1))
+        times = np.append(trajectory.times[seen], trajectory.times[-1])
+        silence = max(silence, float(np.diff(times).max(initial=0.0)))
+    return silence
 
 
 def scaled(baseline: Baseline, model: BaseModel, dataset: Dataset, batch: Batch) -> Tensor:
@@ -203,6 +237,26 @@ class Examples:
         return relative_loss(prediction.mean, targets, typical, mask)
 
 
+class RedrawnExamples:
+    """The windows and masks of an epoch; inputs of a batch are computed when it is needed.
+
+    Args:
+        drawn: windows and masks.
+        reference: of the relative loss; None for that of the model's head.
+    """
+
+    def __init__(self, drawn: Redrawn, *, reference: Reference | None = None) -> None:
+        self._drawn, self._reference = drawn, reference
+
+    def __len__(self) -> int:
+        return len(self._drawn)
+
+    def loss(self, model: BaseModel, index: Tensor, generator: torch.Generator | None) -> Tensor:
+        """As that of `Examples`."""
+        some = Examples(model, self._drawn.take(index), reference=self._reference)
+        return some.loss(model, torch.arange(len(some)), generator)
+
+
 def relative_loss(mean: Tensor, targets: Tensor, typical: Tensor, weights: Tensor | None) -> Tensor:
     """Weighted mean of Huber's loss of the errors in units of typical ones.
 
@@ -222,9 +276,10 @@ def relative_loss(mean: Tensor, targets: Tensor, typical: Tensor, weights: Tenso
 
 
 class TrainingSet:
-    """The examples of every epoch: the trajectories, or tasks that are drawn anew.
+    """The examples of every epoch: the trajectories, or what is drawn anew.
 
-    Tasks of the next epoch are drawn in a thread while the model is trained on those of this one.
+    Tasks, or windows and masks, of the next epoch are drawn in a thread while the model is trained
+    on those of this one.
 
     Args:
         model: that is trained.
@@ -243,17 +298,21 @@ class TrainingSet:
     ) -> None:
         self._model, self._train, self._recipe = model, train, recipe
         self._reference = reference
-        self._next: tuple[int, Future[Examples]] | None = None
-        self._same = None if recipe.tasks is not None else self._examples(train)
-        self._drawer = ThreadPoolExecutor(1) if recipe.tasks is not None else None
+        self._next: tuple[int, Future[Examples | RedrawnExamples]] | None = None
+        drawn = recipe.tasks is not None or recipe.redraw is not None
+        self._same = None if drawn else self._examples(train)
+        self._whole = None if recipe.redraw is None else model.batch(train)
+        self._drawer = ThreadPoolExecutor(1) if drawn else None
 
     def __len__(self) -> int:
         if self._same is not None:
             return len(self._same)
+        if self._whole is not None:
+            return len(self._whole)
         assert self._recipe.tasks is not None
         return number_of_tasks(self._train, self._recipe.tasks, self._recipe.tasks_per_epoch)
 
-    def epoch(self, epoch: int) -> Examples:
+    def epoch(self, epoch: int) -> Examples | RedrawnExamples:
         """The examples of an epoch, the same whenever they are asked for.
 
         Args:
@@ -275,10 +334,13 @@ class TrainingSet:
         if self._drawer is not None:
             self._drawer.shutdown(cancel_futures=True)
 
-    def _drawn(self, epoch: int) -> Examples:
+    def _drawn(self, epoch: int) -> Examples | RedrawnExamples:
         recipe = self._recipe
-        assert recipe.tasks is not None
         seed = [recipe.seed, _EPOCHS, epoch]
+        if self._whole is not None and recipe.redraw is not None:
+            drawn = redraw(self._whole, recipe.redraw, seed=seed)
+            return RedrawnExamples(drawn, reference=self._reference)
+        assert recipe.tasks is not None
         return self._examples(draw_tasks(self._train, recipe.tasks, len(self), seed=seed))
 
     def _examples(self, tasks: Dataset) -> Examples:

@@ -218,6 +218,8 @@ def identity_of(
     if recipe.tasks is None:  # as in runs of versions that had no tasks
         for name in ("tasks", "tasks_per_epoch"):
             identity["training"].pop(name)
+    if recipe.redraw is None:
+        identity["training"].pop("redraw")
     if recipe.loss == "head":
         identity["training"].pop("loss")
     if baselines is not None:

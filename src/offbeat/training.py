@@ -21,10 +21,12 @@ from offbeat.data.trajectory import Dataset
 from offbeat.errors import DivergenceError, InputError
 from offbeat.examples import (
     Examples,
+    RedrawnExamples,
     Reference,
     TrainingSet,
     ValidationSet,
     fitted_baselines,
+    longest_silence,
     ordered,
     reference_tasks,
     validate,
@@ -100,16 +102,17 @@ def fit(
     By default the loss is that of the model's head over the known values of all rows but the first,
     in scaled units. With `config.tasks`, each epoch draws windows and masks anew (see `draw_tasks`)
     and the loss is relative: the error of each value is divided by that of the best baseline for
-    its channel and its time since observation. Batches, their order and all random numbers depend
-    only on `config.seed`.
+    its channel and its time since observation. With `config.redraw`, each epoch draws a window of
+    each trajectory and masks its values anew (see `redraw`); all else is as without. Batches, their
+    order and all random numbers depend only on `config.seed`.
 
     Where the loss or a weight turns infinite or NaN and the best weights are kept, the training
     resumes from these, once, at half the learning rate, and ends with them if it diverges again.
 
     Args:
         model: trained in place.
-        train: the training set; masked values that are known serve as targets. With tasks, whole
-            trajectories.
+        train: the training set; masked values that are known serve as targets. With tasks or
+            redraw, whole trajectories.
         validation: scored after each epoch; with tasks, on tasks that are drawn from it once.
         config: fields that are None, or all of them if it is None, follow the model's recipe.
         out: folder for `log.csv`, checkpoints and the final `model`; a run that was stopped there
@@ -141,6 +144,8 @@ def fit(
     if asked.tasks is not None:
         model.expect_silences(asked.tasks.horizon_s)
     trained_on = ordered(model, train)
+    if asked.redraw is not None:
+        model.expect_silences(longest_silence(trained_on, asked.redraw, seed=asked.seed))
     recipe = recipe_of(model.name, asked, validated=validation is not None)
     reference = None
     if recipe.relative:
@@ -273,7 +278,7 @@ def _recover(model: BaseModel, state: RunState, recipe: Recipe, error: Divergenc
 
 def _epoch(
     model: BaseModel,
-    examples: Examples,
+    examples: Examples | RedrawnExamples,
     state: RunState,
     recipe: Recipe,
     bar: Any,
@@ -305,7 +310,7 @@ def _epoch(
 
 def train_step(
     model: BaseModel,
-    examples: Examples,
+    examples: Examples | RedrawnExamples,
     index: Tensor,
     state: RunState,
     recipe: Recipe,

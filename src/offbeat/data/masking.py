@@ -91,6 +91,30 @@ def mask_out(
     return Dataset(tuple(masked), {**dataset.meta, **meta})
 
 
+def keep_at_random(
+    eligible: NDArray[np.bool_], fractions: NDArray[np.float64], random: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Keeps an exact fraction of entries along the last axis, at random: `rows` of `mask_out`.
+
+    It is the same for many trajectories at once, with other random numbers than `mask_out` draws.
+
+    Args:
+        eligible: (..., rows) True where something is observed.
+        fractions: broadcastable to (...), that stay observed.
+        random: source of random numbers.
+
+    Returns:
+        (..., rows) True at `int(n * fraction)` of the n eligible entries, at one at least.
+    """
+    count = eligible.sum(axis=-1)
+    # 0.29 * 100 is 28.999...: rounded, so that it counts as 29.
+    keep = np.clip(np.floor(np.round(count * fractions, 9)).astype(np.int64), 1, None)
+    keys = np.where(eligible, random.random(eligible.shape), np.inf)
+    last = np.minimum(keep, eligible.shape[-1]) - 1
+    limit = np.take_along_axis(np.sort(keys, axis=-1), last[..., None], axis=-1)
+    return np.asarray((keys <= limit) & eligible)
+
+
 def sensors_of(dataset: Dataset) -> list[list[str]]:
     """Groups of states that are always observed together, in the order of the channels.
 

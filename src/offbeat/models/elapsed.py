@@ -12,6 +12,7 @@ that one time alone, so they do not depend on other rows either.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -82,6 +83,8 @@ class RecurrentState:
 class ElapsedTimes:
     """Elapsed times, from times and masks; all in s, float64.
 
+    Those of single channels are computed when they are first used: many models need none.
+
     Attributes:
         observed: (batch, rows) bool, True where any channel is observed.
         first: (batch, rows) bool, True at the first observed row.
@@ -90,13 +93,7 @@ class ElapsedTimes:
         elapsed: (batch, rows) saturated time since the last observed row, before the row's
             observation.
         elapsed_before: (batch, rows) the same at the row before, after its observation.
-        delta: (batch, rows, channels) time since each channel's last observation (equation 25) on
-            arrival; over a gap it
-            grows as long as `elapsed` does.
-        delta_before: (batch, rows, channels) the same at the row before, after its observation.
-        delta_observed: (batch, rows, channels) the same at the last observed row, after its
-            observation.
-        last: (batch, rows, channels) last value of each channel on arrival.
+        rows: what they are computed from.
     """
 
     observed: Tensor
@@ -105,10 +102,84 @@ class ElapsedTimes:
     gap: Tensor
     elapsed: Tensor
     elapsed_before: Tensor
-    delta: Tensor
-    delta_before: Tensor
-    delta_observed: Tensor
-    last: Tensor
+    rows: _Rows
+
+    @property
+    def delta(self) -> Tensor:
+        """(batch, rows, channels) time since each channel's last observation, on arrival.
+
+        It is that of equation 25; over a gap it grows as long as `elapsed` does.
+        """
+        rows = self.rows
+        return (rows.spread - rows.lost[..., None] - rows.channel_clock).clamp_min(0)
+
+    @property
+    def delta_before(self) -> Tensor:
+        """(batch, rows, channels) the same at the row before, after its observation."""
+        rows = self.rows
+        return ((rows.before - rows.lost_before)[..., None] - rows.channel_clock).clamp_min(0)
+
+    @property
+    def delta_observed(self) -> Tensor:
+        """(batch, rows, channels) the same at the last observed row, after its observation."""
+        rows = self.rows
+        at = torch.minimum(rows.clock, rows.batch.times)[..., None]
+        return (at - rows.channel_clock).clamp_min(0)
+
+    @property
+    def last(self) -> Tensor:
+        """(batch, rows, channels) last value of each channel on arrival."""
+        return self.rows.last
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """What the elapsed times of channels are computed from.
+
+    Attributes:
+        batch: the rows.
+        past: state after the earlier rows.
+        mask: (batch, rows, channels) bool, True = observed.
+        before: (batch, rows) time of the row before.
+        start: (batch,) at which the clock starts.
+        clock: (batch, rows) time of the last observed row, or the start.
+        lost: (batch, rows) part of the time since then beyond the limit.
+        lost_before: (batch, rows) the same at the row before.
+    """
+
+    batch: Batch
+    past: RecurrentState
+    mask: Tensor
+    before: Tensor
+    start: Tensor
+    clock: Tensor
+    lost: Tensor
+    lost_before: Tensor
+
+    @cached_property
+    def index(self) -> Tensor:
+        """(batch, rows, channels) row of the last observation of each channel; -1 without one."""
+        return last_index(self.mask)
+
+    @property
+    def spread(self) -> Tensor:
+        """(batch, rows, channels) time of each row."""
+        return self.batch.times[..., None].expand(self.index.shape)
+
+    @cached_property
+    def channel_at(self) -> Tensor:
+        """(batch, rows, channels) time of the last observation of each channel; -inf without."""
+        return _pick(self.spread, self.index, self.past.channel_at[:, None])
+
+    @cached_property
+    def channel_clock(self) -> Tensor:
+        """(batch, rows, channels) the same, or the start of the clock."""
+        return torch.maximum(self.channel_at, self.start[:, None, None])
+
+    @cached_property
+    def last(self) -> Tensor:
+        """(batch, rows, channels) last value of each channel."""
+        return _pick(self.batch.values, self.index, self.past.last[:, None])
 
 
 def elapsed_times(
@@ -117,6 +188,7 @@ def elapsed_times(
     *,
     elapsed_limit: float,
     from_first_row: bool = False,
+    ends: bool = True,
 ) -> tuple[ElapsedTimes, RecurrentState]:
     """Computes the times at each row of a batch that continues `past`.
 
@@ -125,16 +197,13 @@ def elapsed_times(
         past: state after the earlier rows; its `state`, `updated` and `actions` are kept.
         elapsed_limit: s, at which the time since the last observed row saturates.
         from_first_row: the clock starts at the first row, observed or not.
+        ends: whether the second result is the past after the last row; else it is `past`.
     """
     times = batch.times
     mask = batch.mask & batch.valid[..., None]
     observed = mask.any(dim=2)
-    index, row_index = last_index(mask), last_index(observed[..., None])[..., 0]
-    spread = times[..., None].expand(index.shape)
-
-    channel_at = _pick(spread, index, past.channel_at[:, None])
+    row_index = last_index(observed[..., None])[..., 0]
     observed_at = _pick(times, row_index, past.observed_at[:, None])
-    last = _pick(batch.values, index, past.last[:, None])
     before = torch.cat([past.time[:, None], times[:, :-1]], dim=1)
     before = torch.where(before.isnan(), times, before)
 
@@ -143,11 +212,9 @@ def elapsed_times(
     earliest = torch.where(starts, times, inf).min(dim=1).values
     start = torch.minimum(past.start, earliest)
     clock = torch.maximum(observed_at, start[:, None])
-    channel_clock = torch.maximum(channel_at, start[:, None, None])
     elapsed, lost = _saturate(times - clock, elapsed_limit)
     elapsed_before, lost_before = _saturate(before - clock, elapsed_limit)
-    delta = spread - lost[..., None] - channel_clock
-    delta_before = (before - lost_before)[..., None] - channel_clock
+    rows = _Rows(batch, past, mask, before, start, clock, lost, lost_before)
     result = ElapsedTimes(
         observed=observed,
         first=observed & (row_index < 0) & past.observed_at.isneginf()[:, None],
@@ -155,18 +222,17 @@ def elapsed_times(
         gap=elapsed - elapsed_before,
         elapsed=elapsed,
         elapsed_before=elapsed_before,
-        delta=delta.clamp_min(0),
-        delta_before=delta_before.clamp_min(0),
-        delta_observed=(torch.minimum(clock, times)[..., None] - channel_clock).clamp_min(0),
-        last=last,
+        rows=rows,
     )
+    if not ends:
+        return result, past
     ended = RecurrentState(
         state=past.state,
         time=times[:, -1],
         start=start,
         observed_at=torch.where(observed[:, -1], times[:, -1], observed_at[:, -1]),
-        channel_at=torch.where(mask[:, -1], spread[:, -1], channel_at[:, -1]),
-        last=torch.where(mask[:, -1], batch.values[:, -1], last[:, -1]),
+        channel_at=torch.where(mask[:, -1], rows.spread[:, -1], rows.channel_at[:, -1]),
+        last=torch.where(mask[:, -1], batch.values[:, -1], rows.last[:, -1]),
         updated=past.updated,
         rows=past.rows + batch.rows,
         generator=past.generator,

@@ -251,7 +251,7 @@ class Model(BaseModel):
         Args:
             batch: scaled.
         """
-        return StepTable.of(self.step_inputs(batch)[0])
+        return StepTable.of(self.step_inputs(batch, ends=False)[0])
 
     def run(
         self,
@@ -310,13 +310,14 @@ class Model(BaseModel):
         )
 
     def step_inputs(
-        self, batch: Batch, past: RecurrentState | None = None
+        self, batch: Batch, past: RecurrentState | None = None, *, ends: bool = True
     ) -> tuple[StepInputs, RecurrentState]:
         """The inputs of each step, which do not depend on trained parameters.
 
         Args:
             batch: scaled; rows to come, in order.
             past: state after the earlier rows; by default there are none.
+            ends: whether the past after the last row is needed.
 
         Returns:
             The inputs, and the past after the last row without its state.
@@ -339,16 +340,17 @@ class Model(BaseModel):
             past,
             elapsed_limit=self.elapsed_limit,
             from_first_row=config.clock == "first_row",
+            ends=ends,
         )
-        mask = batch.mask & batch.valid[..., None]
-        values, last = torch.where(mask, batch.values, 0.0), at_rows.last
-        if spec.anchored:
-            values = torch.where(mask, (batch.values - self.mean) / self.std, 0.0)
+        mask = at_rows.rows.mask
+        last = at_rows.last if spec.input_decay else None
+        values = (batch.values - self.mean) / self.std if spec.anchored else batch.values
+        values = torch.where(mask, values, 0.0)
         if spec.bounded and spec.anchored:
             values = values.clamp(-LARGEST_VALUE, LARGEST_VALUE)
         elif spec.bounded:
             values = torch.where(mask, values.clamp(self.low, self.high), 0.0)
-            last = last.clamp(self.low, self.high)
+            last = None if last is None else last.clamp(self.low, self.high)
         update = at_rows.observed
         if config.cell == "none":
             update = at_rows.first
