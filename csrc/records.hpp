@@ -31,7 +31,7 @@ struct Perceptron {
 
 // offbeat.kernels.spec.ScanSpec with the tableau of its solver.
 struct Spec {
-  int channels = 0, hidden = 0, anchored = 0, time_inputs = 0;
+  int channels = 0, hidden = 0, anchored = 0, trend = 0, time_inputs = 0;
   int cell = CELL_GRU, reset_after = 0;
   Perceptron field, decoder;
   int stages = 1, steps = 1;
@@ -53,8 +53,8 @@ struct Quantity {
 template <class T>
 struct InputPointers {
   Quantity<T> gap, update, updated, values, mask, time_input, decay_start, decay_end, delta, last,
-      first_node, node, commit;
-  const T *mean = nullptr, *low = nullptr, *high = nullptr;  // (channels,)
+      first_node, node, commit, level_gain, slope_gain;
+  const T *mean = nullptr, *low = nullptr, *high = nullptr;  // (channels,), with a trend twice
   // (rows,) or null: 1 where the decoded state replaces the observed values.
   const uint8_t* use_prediction = nullptr;
 };
@@ -122,7 +122,7 @@ struct StreamRow {
   T gap = 0, update = 0, updated = 0, first_node = 0, node = 0, commit = 0;
   const T *values = nullptr, *mask = nullptr, *time_input = nullptr, *decay_start = nullptr,
           *decay_end = nullptr, *delta = nullptr, *last = nullptr, *mean = nullptr, *low = nullptr,
-          *high = nullptr;
+          *high = nullptr, *level_gain = nullptr, *slope_gain = nullptr;
   int use_prediction = 0;
   T *state = nullptr, *before = nullptr, *after = nullptr;  // (state,) each, not padded
   T* scratch = nullptr;

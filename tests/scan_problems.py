@@ -82,10 +82,11 @@ class Problem(NamedTuple):
             }
         decay = None if old.decay is None else pairs([0])[0]
         input_decay = None if old.input_decay is None else pairs([0])[0]
+        trend = None if old.trend is None else tuple(left.pop(0) for _ in old.trend)
         field: Any = None
         if old.field is not None:
             field = Layered(pairs(old.field.layers), old.field.activation)  # type: ignore[attr-defined]
-        return ScanParts(cell, decay, input_decay, field, pairs(old.decoder))
+        return ScanParts(cell, decay, input_decay, trend, field, pairs(old.decoder))  # type: ignore[arg-type]
 
 
 class Layered:
@@ -108,6 +109,7 @@ def problem(
     cell: str,
     flow: str,
     anchored: bool = False,
+    trend: bool = False,
     self_feeding: bool = False,
     input_decay: bool = False,
     decay: str = "none",
@@ -122,7 +124,8 @@ def problem(
 ) -> Problem:
     """A scan with random weights; about half of the values are observed, some gaps are 0."""
     generator = torch.Generator().manual_seed(seed)
-    driven = hidden + (channels if anchored else 0)
+    anchors = (2 if trend else 1) * channels if anchored else 0
+    driven = hidden + anchors
     features = {"none": 0, "delta": channels, "elapsed": 1}[decay]
     flow_options = dict(FLOWS[flow] or {})
     no_field = FLOWS[flow] is None or flow_options.pop("cell_only", False)
@@ -140,6 +143,7 @@ def problem(
         gates=gates,
         memory=kind.memory_per_unit * hidden if kind else 0,
         anchored=anchored,
+        trend=trend and anchored,
         time_inputs=time_inputs if has_cell else 0,
         field=() if no_field else (driven, *units, driven),
         bounded=bounded,
@@ -160,6 +164,9 @@ def problem(
     def weight(*shape: int) -> Tensor:
         return normal(*shape).requires_grad_()
 
+    def positive(*shape: int, by: float = 1.0) -> Tensor:
+        return (by * uniform(*shape) + 0.01).requires_grad_()
+
     def layers(sizes: tuple[int, ...]) -> tuple[tuple[Tensor, Tensor], ...]:
         return tuple((weight(o, i), weight(o)) for i, o in itertools.pairwise(sizes))
 
@@ -178,6 +185,9 @@ def problem(
         cell=part,
         decay=(weight(hidden, features), weight(hidden)) if features else None,
         input_decay=(weight(channels), weight(channels)) if input_decay else None,
+        trend=(positive(channels, by=3.0), positive(channels), positive(channels))
+        if spec.trend
+        else None,
         field=Layered(layers(spec.field), activation) if spec.field else None,  # type: ignore[arg-type]
         decoder=layers(spec.decoder),
     )
@@ -205,10 +215,14 @@ def problem(
         last=normal(batch, rows, channels, by=1.0) if input_decay else None,
         mean=normal(channels) if input_decay else None,
         length=length,
-        low=-0.3 - uniform(channels) if bounded and anchored else None,
-        high=0.3 + uniform(channels) if bounded and anchored else None,
+        low=-0.3 - uniform(anchors) if bounded and anchored else None,
+        high=0.3 + uniform(anchors) if bounded and anchored else None,
         fed=tuple(bool(b) for b in uniform(rows) < 0.5) if self_feeding else (),
     )
+    if spec.trend:
+        gains = [mask * uniform(batch, rows, channels) for _ in range(2)]
+        gains[0][uniform(batch, rows, channels) < 0.2] = 1.0
+        given = replace(given, level_gain=gains[0] * mask, slope_gain=gains[1])
     if nodes:
         first, node = (2 * uniform(batch, rows)).floor(), (3 * uniform(batch, rows)).floor()
         far = uniform(batch, rows) < 0.02

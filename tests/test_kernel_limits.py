@@ -218,7 +218,7 @@ TABLES: dict[str, tuple[dict[str, Any], str]] = {
     "columns with gaps": ({"table": np.ones((2, 3, 12), np.float32)[..., ::2]}, "contiguous col"),
     "two axes": ({"table": np.ones((2, 18), np.float32)}, r"table has shape \(2, 18\)"),
     "no trajectory": ({"table": np.ones((0, 3, 6), np.float32)}, "not in the table of 0"),
-    "a short list of places": ({"places": [(0, 1)]}, "number of places is 1, expected 10 to 13"),
+    "a short list of places": ({"places": [(0, 1)]}, "number of places is 1, expected 10 to 15"),
 }
 
 

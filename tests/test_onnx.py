@@ -92,7 +92,7 @@ def test_the_traced_step_predicts_what_a_stream_predicts(variant: str, dtype: to
     times[9:] += 0.3  # longer than the limit of the model's clock
     assert 4 * model.statistics.longest_elapsed < 0.3
     step, past = StreamStep(model), model.empty_state(1)
-    state: tuple[Tensor, ...] = tuple(getattr(past, name) for name in STATE)
+    state: tuple[Tensor, ...] = tuple(getattr(past, name) for name in step.parts)
     stream, got, expected = Stream(model), [], []
     for row in range(one.rows):
         values = np.where(one.observed[row], one.values[row], np.nan)
@@ -103,7 +103,7 @@ def test_the_traced_step_predicts_what_a_stream_predicts(variant: str, dtype: to
         expected.append(stream.predict(times[row]))
         stream.observe(times[row], message(one, row))
         state = tuple(after)
-    assert [part.dtype for part in state] == [getattr(past, name).dtype for name in STATE]
+    assert [part.dtype for part in state] == [getattr(past, name).dtype for name in step.parts]
     assert difference(got, expected) < TOLERANCE[dtype]
 
 

@@ -89,7 +89,10 @@ int gates_of(const Spec& s) {
   const int factor[] = {0, 1, 1, 4, 3};
   return factor[s.cell] * s.hidden;
 }
-int state_of(const Spec& s) { return s.anchored + s.hidden + (s.cell == CELL_LSTM ? s.hidden : 0); }
+int anchors_of(const Spec& s) { return s.trend ? 2 * s.anchored : s.anchored; }
+int state_of(const Spec& s) {
+  return anchors_of(s) + s.hidden + (s.cell == CELL_LSTM ? s.hidden : 0);
+}
 
 int64_t perceptron_flat(const Perceptron& p) {
   int64_t n = 0;
@@ -105,6 +108,7 @@ int64_t flat_size(const Spec& s) {
   if (s.cell != CELL_NONE) n += g * s.anchored;
   if (s.decay_features) n += h * s.decay_features + h;
   if (s.input_decay) n += 2 * s.channels;
+  if (s.trend) n += 3 * s.anchored;
   return n + perceptron_flat(s.field) + perceptron_flat(s.decoder);
 }
 
@@ -129,7 +133,8 @@ Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_in
              bool reset_after, const std::vector<int64_t>& field, int64_t activation,
              const std::vector<std::vector<double>>& a, const std::vector<double>& b, int64_t steps,
              double max_step, bool nodes, double decay_span, bool bounded, int64_t decay_features,
-             int64_t decay_rows, bool input_decay, const std::vector<int64_t>& decoder) {
+             int64_t decay_rows, bool input_decay, const std::vector<int64_t>& decoder,
+             bool trend) {
   Spec s;
   s.channels = int(in_range("channels", channels, 1, MAX_UNITS));
   s.hidden = int(in_range("hidden_size", hidden, 1, MAX_UNITS));
@@ -138,6 +143,8 @@ Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_in
   if (anchored && anchored != channels)
     refuse("the number of anchored channels is " + std::to_string(anchored) + ", expected 0 or " +
            std::to_string(channels));
+  s.trend = trend;
+  if (trend && !anchored) refuse("trend is True, but no channel is anchored");
   s.cell = int(in_range("cell", cell, CELL_NONE, CELL_GRU));
   s.reset_after = reset_after;
   if (reset_after && cell != CELL_GRU) refuse("reset_after is True, but the cell is not a GRU");
@@ -165,7 +172,7 @@ Spec spec_of(int64_t channels, int64_t hidden, int64_t anchored, int64_t time_in
   if (nodes && decay_rows != CONTINUOUS) refuse("a scan with nodes has a continuous decay");
   s.field = perceptron_of(field, activation);
   s.decoder = perceptron_of(decoder, TANH);
-  const int64_t driven = anchored + hidden;
+  const int64_t driven = anchors_of(s) + hidden;
   if (s.field.layers && (field.front() != driven || field.back() != driven))
     refuse("the vector field maps " + std::to_string(field.front()) + " units to " +
            std::to_string(field.back()) + ", expected " + std::to_string(driven) + " to " +

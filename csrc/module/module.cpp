@@ -44,6 +44,7 @@ namespace {
 #include "step_inputs.hpp"
 #include "batch.hpp"
 #include "perceptron.hpp"
+#include "gains.hpp"
 #include "stream.hpp"
 
 template <class T>
@@ -56,13 +57,15 @@ void bind(nb::module_& m, const char* suffix) {
              Maybe<T> mask, Maybe<T> time_input, Maybe<T> decay_start, Maybe<T> decay_end,
              Maybe<T> delta, Maybe<T> last, Maybe<T> mean,
              std::optional<Const<uint8_t>> use_prediction, std::optional<Const<int64_t>> length,
-             Maybe<T> first_node, Maybe<T> node, Maybe<T> commit, Maybe<T> low, Maybe<T> high) {
+             Maybe<T> first_node, Maybe<T> node, Maybe<T> commit, Maybe<T> low, Maybe<T> high,
+             Maybe<T> level_gain, Maybe<T> slope_gain) {
             if (!gap || gap->ndim() != 2)
               refuse("gap has shape " + (gap ? shape_of(*gap) : "None") +
                      ", expected (batch, rows)");
             const int64_t rows = int64_t(gap->shape(1));
             new (self) StepInputs<T>{{gap, update, updated, values, mask, time_input, decay_start,
-                                      decay_end, delta, last, first_node, node, commit},
+                                      decay_end, delta, last, first_node, node, commit, level_gain,
+                                      slope_gain},
                                      low,
                                      high,
                                      mean,
@@ -81,7 +84,9 @@ void bind(nb::module_& m, const char* suffix) {
           nb::arg("mean").noconvert().none(), nb::arg("use_prediction").noconvert().none(),
           nb::arg("length").noconvert().none(), nb::arg("first_node").noconvert() = nb::none(),
           nb::arg("node").noconvert() = nb::none(), nb::arg("commit").noconvert() = nb::none(),
-          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none())
+          nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none(),
+          nb::arg("level_gain").noconvert() = nb::none(),
+          nb::arg("slope_gain").noconvert() = nb::none())
       .def(
           "__init__",
           [](StepInputs<T>* self, Const<T> table, Const<int64_t> index,
@@ -91,7 +96,7 @@ void bind(nb::module_& m, const char* suffix) {
             if (table.ndim() != 3)
               refuse("table has shape " + shape_of(table) +
                      ", expected (trajectories, rows, columns)");
-            // The last quantities belong to nodes, and may be left out.
+            // The last quantities belong to nodes and trends, and may be left out.
             in_range("the number of places", int64_t(places.size()), FIRST_NODE, QUANTITIES);
             places.resize(QUANTITIES);
             new (self) StepInputs<T>{{},     low,   high,  mean,   use_prediction,
@@ -155,6 +160,15 @@ void bind(nb::module_& m, const char* suffix) {
       nb::arg("shape"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
       nb::arg("x").noconvert(), nb::arg("tape").noconvert(), nb::arg("to_y").noconvert(),
       nb::arg("to_weights").noconvert(), nb::arg("to_x").noconvert().none(), nb::arg("threads"));
+  m.def(
+      "filter_gains",
+      [](Const<double> filters, Const<double> delta, Const<bool> mask, Const<bool> started,
+         Array<double> covariance, Array<T> level, Array<T> slope, double unit) {
+        filter_gains<T>(filters, delta, mask, started, covariance, level, slope, unit);
+      },
+      nb::arg("filters").noconvert(), nb::arg("delta").noconvert(), nb::arg("mask").noconvert(),
+      nb::arg("started").noconvert(), nb::arg("covariance").noconvert(),
+      nb::arg("level").noconvert(), nb::arg("slope").noconvert(), nb::arg("unit"));
   bind_stream<T>(m, end);
 }
 
@@ -186,17 +200,19 @@ NB_MODULE(_cpu, m) {
              int64_t cell, bool reset_after, const std::vector<int64_t>& field, int64_t activation,
              const std::vector<std::vector<double>>& a, const std::vector<double>& b, int64_t steps,
              double max_step, bool nodes, double decay_span, bool bounded, int64_t decay_features,
-             int64_t decay_rows, bool input_decay, const std::vector<int64_t>& decoder) {
+             int64_t decay_rows, bool input_decay, const std::vector<int64_t>& decoder,
+             bool trend) {
             new (self) Spec(spec_of(channels, hidden, anchored, time_inputs, cell, reset_after,
                                     field, activation, a, b, steps, max_step, nodes, decay_span,
-                                    bounded, decay_features, decay_rows, input_decay, decoder));
+                                    bounded, decay_features, decay_rows, input_decay, decoder,
+                                    trend));
           },
           nb::arg("channels"), nb::arg("hidden"), nb::arg("anchored"), nb::arg("time_inputs"),
           nb::arg("cell"), nb::arg("reset_after"), nb::arg("field"), nb::arg("activation"),
           nb::arg("a"), nb::arg("b"), nb::arg("steps"), nb::arg("max_step"),
           nb::arg("nodes") = false, nb::arg("decay_span") = 1.0, nb::arg("bounded") = false,
           nb::arg("decay_features"), nb::arg("decay_rows"), nb::arg("input_decay"),
-          nb::arg("decoder"))
+          nb::arg("decoder"), nb::arg("trend") = false)
       .def_prop_ro("flat_size", [](const Spec& s) { return flat_size(s); })
       .def_prop_ro("state_size", [](const Spec& s) { return state_of(s); });
   nb::class_<Perceptron>(m, "Perceptron")

@@ -14,11 +14,13 @@ enum {
   FIRST_NODE,
   NODE,
   COMMIT,
+  LEVEL_GAIN,
+  SLOPE_GAIN,
   QUANTITIES
 };
-const char* const NAMES[QUANTITIES] = {"gap",        "update",      "updated",   "values", "mask",
-                                       "time_input", "decay_start", "decay_end", "delta",  "last",
-                                       "first_node", "node",        "commit"};
+const char* const NAMES[QUANTITIES] = {
+    "gap",       "update", "updated", "values",     "mask", "time_input", "decay_start", "decay_end",
+    "delta",     "last",   "first_node", "node",    "commit", "level_gain", "slope_gain"};
 
 // Step inputs as Python passes them: one array per quantity, or a table of many trajectories with
 // the quantities as columns and the indices of the trajectories of this batch.
@@ -86,10 +88,14 @@ void take_rows(Job<T>& job, const Spec& s, const StepInputs<T>& f, int64_t batch
     r.node = f.get(NODE, batch, -1);
     r.commit = f.get(COMMIT, batch, -1);
   }
+  if (s.trend) {
+    r.level_gain = f.get(LEVEL_GAIN, batch, s.channels);
+    r.slope_gain = f.get(SLOPE_GAIN, batch, s.channels);
+  }
   if (s.bounded && s.anchored) {
     if (!f.low || !f.high) refuse("low or high is missing; a bounded scan needs them");
-    check_shape("low", *f.low, {s.channels});
-    check_shape("high", *f.high, {s.channels});
+    check_shape("low", *f.low, {anchors_of(s)});
+    check_shape("high", *f.high, {anchors_of(s)});
     r.low = f.low->data(), r.high = f.high->data();
   }
   if (s.decoder.layers && f.use_prediction) {

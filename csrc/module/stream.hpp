@@ -29,7 +29,8 @@ class StreamEngine {
   StreamEngine(const Spec& spec, const std::string& set, const Const<T>& weights,
                const Const<T>& mean, const Const<T>& std, const std::vector<int64_t>& decoder,
                const Maybe<T>& decoder_weights, const Const<T>& first_state, const Maybe<T>& low,
-               const Maybe<T>& high, const TimeSettings& settings)
+               const Maybe<T>& high, const Maybe<double>& filters, const Maybe<double>& prior,
+               const TimeSettings& settings)
       : spec_(spec),
         kernels_(typed<T>(find_instruction_set(set))),
         time_(settings),
@@ -60,10 +61,18 @@ class StreamEngine {
     kernels_.stream_pack(spec_, weights.data(), packed_.get());
     if (spec.bounded) {
       if (!low || !high) refuse("low or high is None, but this model is bounded");
-      check_shape("low", *low, {C});
-      check_shape("high", *high, {C});
-      low_.assign(low->data(), low->data() + C);
-      high_.assign(high->data(), high->data() + C);
+      const int n = spec.anchored ? anchors_of(spec) : C;
+      check_shape("low", *low, {n});
+      check_shape("high", *high, {n});
+      low_.assign(low->data(), low->data() + n);
+      high_.assign(high->data(), high->data() + n);
+    }
+    if (spec.trend) {
+      if (!filters || !prior) refuse("filters or prior is None, but this model has a trend");
+      filters_ = filter_table(*filters, C);
+      check_shape("prior", *prior, {C, 3});
+      check_contiguous("prior", *prior);
+      first_.covariance.assign(prior->data(), prior->data() + 3 * C);
     }
     mean_.assign(mean.data(), mean.data() + C);
     std_.assign(std.data(), std.data() + C);
@@ -71,7 +80,8 @@ class StreamEngine {
     first_.last = mean_;
     first_.channel_at.assign(C, -INFINITY);
     now_ = first_;
-    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &last_, &out_})
+    for (std::vector<T>* v : {&values_, &mask_, &delta_, &start_, &end_, &last_, &out_,
+                              &level_gain_, &slope_gain_})
       v->assign(C, T(0));
     time_input_.assign(std::max(spec.time_inputs, 1), T(0));
     before_.assign(S, T(0));
@@ -85,6 +95,7 @@ class StreamEngine {
     check_shape("mask", mask, {spec_.channels});
     run(time, values.data(), mask.data(), use_prediction);
     now_.state.swap(after_);
+    now_.covariance.swap(next_covariance_);
     now_.time = time;
     now_.start = next_start_;
     if (observed_) now_.observed_at = time;
@@ -116,8 +127,10 @@ class StreamEngine {
   void save(int slot) { slots_.at(slot) = now_; }
   void load(int slot) { now_ = slots_.at(slot); }
 
-  // state, time, start, observed_at, channel_at, last, updated, rows: exact as doubles.
-  int64_t size() const { return int64_t(now_.state.size()) + 2 * spec_.channels + 5; }
+  // state, time, start, observed_at, channel_at, last, updated, covariance, rows: exact as doubles.
+  int64_t size() const {
+    return int64_t(now_.state.size() + now_.covariance.size()) + 2 * spec_.channels + 5;
+  }
   void export_to(Array<double> out) const {
     check_shape("out", out, {size()});
     double* p = out.data();
@@ -125,7 +138,9 @@ class StreamEngine {
     *p++ = now_.time, *p++ = now_.start, *p++ = now_.observed_at;
     for (double v : now_.channel_at) *p++ = v;
     for (T v : now_.last) *p++ = v;
-    *p++ = now_.updated, *p++ = double(now_.rows);
+    *p++ = now_.updated;
+    for (double v : now_.covariance) *p++ = v;
+    *p++ = double(now_.rows);
   }
   void restore(const Const<double>& in) {
     check_shape("state", in, {size()});
@@ -136,14 +151,16 @@ class StreamEngine {
     now_.time = *p++, now_.start = *p++, now_.observed_at = *p++;
     for (double& v : now_.channel_at) v = *p++;
     for (T& v : now_.last) v = T(*p++);
-    now_.updated = *p++ != 0, now_.rows = int64_t(rows);
+    now_.updated = *p++ != 0;
+    for (double& v : now_.covariance) v = *p++;
+    now_.rows = int64_t(rows);
   }
   int64_t rows() const { return now_.rows; }
 
  private:
   struct State {
     std::vector<T> state, last;
-    std::vector<double> channel_at;
+    std::vector<double> channel_at, covariance;
     double time = NAN, start = INFINITY, observed_at = -INFINITY;
     bool updated = false;
     int64_t rows = 0;
@@ -176,12 +193,21 @@ class StreamEngine {
     update_ = time_.starts_only ? observed_ && std::isinf(now_.observed_at)
               : time_.every_row ? true
                                 : observed_;
-    if (spec_.decay_features || spec_.input_decay || time_.time_input == TIME_INPUT_DELTA) {
+    next_covariance_ = now_.covariance;
+    if (spec_.decay_features || spec_.input_decay || time_.time_input == TIME_INPUT_DELTA ||
+        spec_.trend) {
       for (int c = 0; c < C; ++c) {
         const double channel_clock = std::max(now_.channel_at[c], next_start_);
         const double delta = std::max(time - lost - channel_clock, 0.0);
         const double delta_before = std::max((before - lost_before) - channel_clock, 0.0);
         delta_[c] = T(delta / time_.unit);
+        if (spec_.trend) {
+          double level = 0, slope = 0;
+          if (mask && mask[c])
+            filter_gain(filters_, c, delta, !std::isinf(now_.channel_at[c]), time_.unit,
+                        next_covariance_.data() + 3 * c, level, slope);
+          level_gain_[c] = T(level), slope_gain_[c] = T(slope);
+        }
         if (!time_.exponential && !spec_.nodes)
           start_[c] = T(delta_before / time_.unit), end_[c] = delta_[c];
         if (!time_.exponential && spec_.nodes) {
@@ -223,6 +249,7 @@ class StreamEngine {
     row.decay_start = start_.data(), row.decay_end = end_.data();
     row.delta = delta_.data(), row.last = last_.data(), row.mean = mean_.data();
     row.low = low_.data(), row.high = high_.data();
+    row.level_gain = level_gain_.data(), row.slope_gain = slope_gain_.data();
     row.use_prediction = use_prediction;
     row.state = now_.state.data(), row.before = before_.data(), row.after = after_.data();
     row.scratch = scratch_.get();
@@ -249,7 +276,9 @@ class StreamEngine {
   Perceptron decoder_;
   Buffer<T> packed_, scratch_, decoder_packed_, decoder_scratch_;
   std::vector<T> mean_, std_, low_, high_, values_, mask_, delta_, start_, end_, last_, time_input_,
-      before_, after_, out_;
+      before_, after_, out_, level_gain_, slope_gain_;
+  std::vector<double> next_covariance_;
+  FilterTable filters_;
   State first_, now_;
   std::vector<State> slots_;
   bool observed_ = false, update_ = false;
@@ -266,7 +295,7 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
              Maybe<T> decoder_weights, Const<T> first_state, Maybe<T> low, Maybe<T> high,
              double unit, double time_input_unit, double elapsed_limit, double longest_delta,
              int64_t time_input, bool from_first_row, bool last_row, bool every_row,
-             bool starts_only, bool exponential) {
+             bool starts_only, bool exponential, Maybe<double> filters, Maybe<double> prior) {
             TimeSettings c;
             c.unit = unit, c.time_input_unit = time_input_unit, c.elapsed_limit = elapsed_limit;
             c.longest_delta = longest_delta, c.time_input = time_input,
@@ -274,7 +303,7 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
             c.last_row = last_row, c.every_row = every_row, c.starts_only = starts_only;
             c.exponential = exponential;
             new (self) StreamEngine<T>(spec, set, weights, mean, std, decoder, decoder_weights,
-                                       first_state, low, high, c);
+                                       first_state, low, high, filters, prior, c);
           },
           nb::arg("spec"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
           nb::arg("mean").noconvert(), nb::arg("std").noconvert(), nb::arg("decoder"),
@@ -282,7 +311,8 @@ void bind_stream(nb::module_& m, const std::string& suffix) {
           nb::arg("low").noconvert() = nb::none(), nb::arg("high").noconvert() = nb::none(),
           nb::arg("unit"), nb::arg("time_input_unit"), nb::arg("elapsed_limit"),
           nb::arg("longest_delta"), nb::arg("time_input"), nb::arg("from_first_row"),
-          nb::arg("last_row"), nb::arg("every_row"), nb::arg("starts_only"), nb::arg("exponential"))
+          nb::arg("last_row"), nb::arg("every_row"), nb::arg("starts_only"), nb::arg("exponential"),
+          nb::arg("filters").noconvert() = nb::none(), nb::arg("prior").noconvert() = nb::none())
       .def("reset", &StreamEngine<T>::reset)
       .def("observe", &StreamEngine<T>::observe, nb::arg("time"), nb::arg("values").noconvert(),
            nb::arg("mask").noconvert(), nb::arg("use_prediction"))

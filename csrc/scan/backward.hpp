@@ -100,12 +100,32 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
       k.push(M_INNOV, gate, at(l.innovation));
       P::template transposed<false>(c.map.m[M_INNOV], c.packed, c.lanes, gate, k.z);
       const T* x = at(l.before);
+      T* gv = g + int64_t(d.A) * W;
+      T* to_odds = k.sums + c.map.trend_sum + int64_t(d.A) * VW;
+      T* to_factor = to_odds + int64_t(d.A) * VW;
       P::each_unit(d.A, [&](int64_t i, int, int n) {
         const V m = load<T>(f.mask + i);
-        V to_x = m * load<T>(k.z + i);
+        V to_innovation = load<T>(k.z + i), kept = 1 - m;
+        if (d.trend) {
+          const V value = load<T>(f.values + i), gain = load<T>(f.level_gain + i);
+          const V slope = load<T>(f.slope_gain + i), odds = P::constant(c.trend.odds, n);
+          V outside;
+          const V corrected = level_gain<P>(c, f, i, n, value, load<T>(x + i), outside);
+          const V whole = fma(1 - gain, odds, gain);
+          V by_odds = -gain * (1 - gain) / (whole * whole) * (value - load<T>(x + i));
+          by_odds = outside != T(0) ? splat(0) : by_odds;
+          T* own = to_odds + n * VW;
+          store<T>(own, fma(by_odds, load<T>(g + i), load<T>(own)));
+          own = to_factor + n * VW;
+          const V to_slope = load<T>(gv + i) * slope;
+          store<T>(own, fma(to_slope, load<T>(at(l.innovation) + i), load<T>(own)));
+          to_innovation = fma(to_slope, P::constant(c.trend.factor, n), to_innovation);
+          kept = 1 - corrected;
+        }
+        V to_x = m * to_innovation;
         if (s.bounded)
           to_x = to_x * inside(load<T>(x + i), P::constant(c.low, n), P::constant(c.high, n));
-        store<T>(g + i, (1 - m) * load<T>(g + i) - to_x);
+        store<T>(g + i, kept * load<T>(g + i) - to_x);
       });
     }
     if (values_need_gradient)
@@ -136,6 +156,9 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
       T* kept = to(k.places.field) + p.place(q) * s.stages * k.places.field_size * W;
       runge_kutta_backward<P>(k, p.span, g, step + l.stage * W, step + l.limited * W, kept);
     }
+    if (d.trend)
+      along_trend_backward<P>(k, p, s.nodes && q < p.whole, g, step + l.slopes * W,
+                              step + l.stopped * W);
     if (!d.F) continue;
     const T* applied = step + l.applied * W;
     const T* factor = step + l.factor * W;
@@ -219,6 +242,29 @@ static NOINLINE void row_backward(Back<P>& k, const RowInputs<P>& f, const T* ta
       store<T>(to_bias + n * VW, load<T>(to_bias + n * VW) + to_raw);
     });
   }
+}
+
+template <class P>
+static NOINLINE void along_trend_backward(Back<P>& k, const Steps<P>& p, bool whole, T* g,
+                                          const T* slopes, const T* stopped) {
+  const Context<P>& c = k.c;
+  const int A = c.map.d.A;
+  T* gv = g + int64_t(A) * P::W;
+  T* to_damping = k.sums + c.map.trend_sum;
+  P::each_unit(A, [&](int64_t i, int lane, int n) {
+    const Motion m = motion_of<P>(c, p, whole, lane, n);
+    const V v = load<T>(slopes + i), to_v = load<T>(gv + i);
+    V to_moved = load<T>(g + i);
+    if (c.s.bounded) {
+      const V kind = load<T>(stopped + i), all = to_moved;
+      to_moved = kind > T(0) ? all : splat(0);
+      store<T>(g + i, kind != T(0) ? all : splat(0));
+    }
+    const V span = load<T>(p.span + lane);
+    T* own = to_damping + n * VW;
+    store<T>(own, load<T>(own) - v * (to_v * span * m.kept + to_moved * m.bend));
+    store<T>(gv + i, fma(m.reach, to_moved, m.kept * to_v));
+  });
 }
 
 template <class P>

@@ -54,7 +54,7 @@ static Steps<P> steps_to_row(const Spec& s, const RowInputs<P>& f) {
   Steps<P> p;
   if (!s.nodes) {
     if (s.field.layers) p.whole = steps_of<P>(s, f.gap, p.count);
-    return p;
+    return p;  // a trend without a field is exact over the whole gap
   }
   p.whole = 0;
   for (int i = 0; i < Steps<P>::N; ++i) {
@@ -73,7 +73,10 @@ template <class P>
 static void set_step(const Spec& s, const RowInputs<P>& f, int k, Steps<P>& p) {
   for (int i = 0; i < Steps<P>::N; ++i) {
     if (!s.nodes) {
-      if (s.field.layers) p.span[i] = T(k) < p.count[i] ? f.gap[i] / p.count[i] : T(0);
+      if (s.field.layers)
+        p.span[i] = T(k) < p.count[i] ? f.gap[i] / p.count[i] : T(0);
+      else
+        p.span[i] = f.gap[i];
       continue;
     }
     const bool read = k == p.whole;
@@ -209,6 +212,9 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
         store<T>(applied + i, after);
       });
     }
+    if (d.trend)
+      along_trend<P>(c, p, s.nodes && k < p.whole, state, step + l.slopes * W,
+                     step + l.stopped * W);
     if (s.field.layers)
       runge_kutta<P>(c, p.span, state, step + l.stage * W, step + l.limited * W, z);
   }
@@ -224,7 +230,78 @@ static NOINLINE void row_forward(const Context<P>& c, const RowInputs<P>& f, T* 
   });
 }
 
-// The observation of a row: anchored channels take the observed values, and the cell acts.
+// What a step does to a channel: from node to node by constants, else by the step's length.
+template <class P>
+static INLINE Motion motion_of(const Context<P>& c, const Steps<P>& p, bool whole, int lane,
+                               int unit) {
+  if (!whole) return motion(P::constant(c.trend.damping, unit), load<T>(p.span + lane));
+  const V active = load<T>(p.active + lane), none = splat(0);
+  return {active != T(0) ? P::constant(c.trend.kept, unit) : splat(1),
+          active != T(0) ? P::constant(c.trend.reach, unit) : none,
+          active != T(0) ? P::constant(c.trend.bend, unit) : none};
+}
+
+// The damped trend of the anchored channels over a step, which does not leave the range of x. The
+// tape keeps the slopes before it, and what became of x, as `limited` of `runge_kutta`.
+template <class P>
+static NOINLINE void along_trend(const Context<P>& c, const Steps<P>& p, bool whole, T* state,
+                                 T* slopes, T* stopped) {
+  const Dims& d = c.map.d;
+  const Slopes<P> to(d, state, c.work);
+  P::each_unit(d.A, [&](int64_t i, int lane, int k) {
+    const Motion m = motion_of<P>(c, p, whole, lane, k);
+    const V old = load<T>(state + i), v = load<T>(to.v + i);
+    V moved = fma(m.reach, v, old);
+    store<T>(slopes + i, v);
+    if (c.s.bounded)
+      store<T>(stopped + i, stop(old, P::constant(c.low, k), P::constant(c.high, k), moved));
+    store<T>(to.new_x + i, moved);
+    store<T>(to.new_v + i, m.kept * v);
+  });
+  to.done(d, state);
+}
+// x and v of a state. In a stream they are next to each other, so whole vectors of new ones are
+// stored elsewhere first.
+template <class P>
+struct Slopes {
+  T *v, *new_x, *new_v;
+  Slopes(const Dims& d, T* state, T* work)
+      : v(state + int64_t(d.A) * P::W),
+        new_x(P::ONE ? work : state),
+        new_v(P::ONE ? work + P::pad(d.A) : v) {}
+  void done(const Dims& d, T* state) const {
+    if (!P::ONE) return;
+    for (int i = 0; i < d.A; ++i) state[i] = new_x[i], v[i] = new_v[i];
+  }
+};
+// Stops a step where it leaves the range; outside of it, it can only move back. Returns 1 for the
+// result of the step, 0 for an end of the range, -1 for the old state, which was outside of it.
+static INLINE V stop(V old, V low, V high, V& moved) {
+  const V least = old < low ? old : low, most = old > high ? old : high;
+  V kind = moved < least ? (old < low ? splat(-1) : splat(0)) : splat(1);
+  moved = moved < least ? least : moved;
+  kind = moved > most ? (old > high ? splat(-1) : splat(0)) : kind;
+  moved = moved > most ? most : moved;
+  return kind;
+}
+
+// The gain of a level: 1 where the value or the state is out of range.
+template <class P>
+static INLINE V level_gain(const Context<P>& c, const RowInputs<P>& f, int64_t i, int k, V value,
+                           V x, V& outside) {
+  const V gain = load<T>(f.level_gain + i);
+  const V corrected = gain / fma(1 - gain, P::constant(c.trend.odds, k), gain);
+  outside = splat(0);
+  if (!c.s.bounded) return corrected;
+  const V low = P::constant(c.low, k), high = P::constant(c.high, k);
+  outside = within(value, low, high) != value ? splat(1) : splat(0);
+  outside = within(x, low, high) != x ? splat(1) : outside;
+  outside = load<T>(f.mask + i) != T(0) ? outside : splat(0);
+  return outside != T(0) ? splat(1) : corrected;
+}
+
+// The observation of a row: anchored channels take the observed values, or with a trend move by
+// gains, and the cell acts.
 template <class P>
 static NOINLINE void update(const Context<P>& c, const RowInputs<P>& f, T* state, T* tape) {
   const Spec& s = c.s;
@@ -243,10 +320,24 @@ static NOINLINE void update(const Context<P>& c, const RowInputs<P>& f, T* state
       store<T>(e + i, load<T>(f.mask + i) * (value - x));
     });
     P::template affine<true>(c.map.m[M_INNOV], c.packed, c.lanes, e, gate);
-    P::each(d.A, [&](int64_t i, int) {
-      const V m = load<T>(f.mask + i);
-      store<T>(state + i, m * load<T>(f.values + i) + (1 - m) * load<T>(state + i));
-    });
+    if (d.trend) {
+      const Slopes<P> to(d, state, c.work);
+      P::each_unit(d.A, [&](int64_t i, int, int k) {
+        const V value = load<T>(f.values + i), x = load<T>(state + i);
+        V outside;
+        const V gain = level_gain<P>(c, f, i, k, value, x, outside);
+        const V factor = load<T>(f.slope_gain + i) * P::constant(c.trend.factor, k);
+        const V v = fma(factor, load<T>(e + i), load<T>(to.v + i));
+        store<T>(to.new_x + i, gain * value + (1 - gain) * x);
+        store<T>(to.new_v + i, v);
+      });
+      to.done(d, state);
+    } else {
+      P::each(d.A, [&](int64_t i, int) {
+        const V m = load<T>(f.mask + i);
+        store<T>(state + i, m * load<T>(f.values + i) + (1 - m) * load<T>(state + i));
+      });
+    }
   }
   cell_forward<P>(c, f, state + l.h_at * W, state + l.c_at * W, gate, tape + l.inner * W);
 }
@@ -258,8 +349,7 @@ static INLINE void copy(int units, const T* from, T* to) {
 
 // One step of the solver, of length `span` in each lane. The tape keeps the stages and their
 // layers. In a bounded scan the field is evaluated within the range of the state, and the step does
-// not leave it; `limited` keeps what the state became: 1 the result of the step, 0 an end of the
-// range, -1 the old state, which was outside of it.
+// not leave it; `limited` keeps what `stop` returned.
 template <class P>
 static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T* stages,
                                  T* limited, T* z) {
@@ -295,15 +385,8 @@ static NOINLINE void runge_kutta(const Context<P>& c, const T* span, T* state, T
       if (s.b[q] != 0) sum = fma(splat(T(s.b[q])), load<T>(slopes + q * size + i), sum);
     const V old = load<T>(state + i);
     V moved = fma(load<T>(span + lane), sum, old);
-    if (s.bounded) {
-      const V low = P::constant(c.low, k), high = P::constant(c.high, k);
-      const V least = old < low ? old : low, most = old > high ? old : high;
-      V kind = moved < least ? (old < low ? splat(-1) : splat(0)) : splat(1);
-      moved = moved < least ? least : moved;
-      kind = moved > most ? (old > high ? splat(-1) : splat(0)) : kind;
-      moved = moved > most ? most : moved;
-      store<T>(limited + i, kind);
-    }
+    if (s.bounded)
+      store<T>(limited + i, stop(old, P::constant(c.low, k), P::constant(c.high, k), moved));
     store<T>(state + i, moved);
   });
 }
@@ -315,7 +398,7 @@ static int widest(const Spec& s) {
   for (const Perceptron* p : {&s.field, &s.decoder})
     for (int l = 0; l <= p->layers; ++l)
       if (P::pad(p->sizes[l]) + VW > n) n = P::pad(p->sizes[l]) + VW;
-  const int driven = P::pad(d.A) + P::pad(d.H);
+  const int driven = P::pad(d.X) + P::pad(d.H);
   return (n > driven ? n : driven) + VW;
 }
 template <class P>
@@ -325,7 +408,7 @@ static int64_t work_slopes(const Spec& s) {
 template <class P>
 static int64_t work_size(const Spec& s) {
   const Dims d = dims(s);
-  const int64_t slope = int64_t(P::pad(d.A) + P::pad(d.H)) * P::W + VW;
+  const int64_t slope = int64_t(P::pad(d.X) + P::pad(d.H)) * P::W + VW;
   return work_slopes<P>(s) + slope * s.stages + VW;
 }
 
@@ -378,7 +461,9 @@ static Context<P> context(const Job<T>& job, const Block& b, const Map& map, T* 
                     work,
                     b.lanes,
                     limits,
-                    limits + P::pad(map.d.A) + P::pad(map.d.H)};
+                    limits + P::pad(map.d.X) + P::pad(map.d.H),
+                    trend(*job.spec, map.d, job.packed + map.packed_trend,
+                          limits + range_size(*job.spec, map.d) - 3 * up(map.d.A, VW))};
 }
 
 template <class P>

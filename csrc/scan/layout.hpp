@@ -54,8 +54,8 @@ static Net net(const Perceptron& shape) {
 template <class P>
 struct Layout {
   int64_t u, start, end, before, node, gate, inner, innovation, decoded, h_before;
-  int64_t decoder, step, step_size, applied, factor, arrived, limited, stage, stage_size, y,
-      network, size;
+  int64_t decoder, step, step_size, applied, factor, arrived, slopes, stopped, limited, stage,
+      stage_size, y, network, size;
   Net field_net, decoder_net;
   int64_t x_at, h_at, c_at, state;  // inside a state
 };
@@ -68,7 +68,7 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
     at += P::pad(n);
     return here;
   };
-  l.h_at = P::pad(d.A);
+  l.h_at = P::pad(d.X);
   l.c_at = l.h_at + P::pad(d.H);
   l.state = l.c_at + (d.lstm ? P::pad(d.H) : 0);
   l.u = at, at += P::pad(d.I) + (P::ONE ? VW : 0);
@@ -91,10 +91,14 @@ static Layout<P> layout(const Spec& s, const Dims& d, int max_steps) {
     l.factor = step, step += P::pad(d.H);
     l.arrived = step, step += P::pad(d.H);
   }
-  l.limited = step, step += s.bounded ? P::pad(d.A) + P::pad(d.H) : 0;
+  if (d.trend) {
+    l.slopes = step, step += P::pad(d.A);
+    l.stopped = step, step += s.bounded ? P::pad(d.A) : 0;
+  }
+  l.limited = step, step += s.bounded ? P::pad(d.X) + P::pad(d.H) : 0;
   l.stage = step;
   l.y = 0;
-  l.network = P::pad(d.A) + P::pad(d.H);
+  l.network = P::pad(d.X) + P::pad(d.H);
   l.stage_size = s.field.layers ? l.network + l.field_net.size : 0;
   step += l.stage_size * s.stages;
   l.step_size = step;
@@ -110,15 +114,15 @@ static int64_t tape_row(const Spec& s, int max_steps, int vectors) {
 template <class P>
 struct RowInputs {
   T *gap, *update, *updated, *valid, *first, *node, *commit, *values, *mask, *time_input, *start,
-      *end, *delta, *last;
+      *end, *delta, *last, *level_gain, *slope_gain;
   const T* mean;
   T* zeros;  // inputs of a lane past its last row
   bool active = false, use_prediction = false;
 };
 static constexpr int ROW_SCALARS = 7;
 static int64_t row_inputs_size(const Dims& d, int lanes) {
-  return ROW_SCALARS * (lanes < VW ? VW : lanes) + (4 * d.C + d.time_inputs + 2 * d.F) * lanes +
-         widest_quantity(d);
+  return ROW_SCALARS * (lanes < VW ? VW : lanes) +
+         ((d.trend ? 6 : 4) * d.C + d.time_inputs + 2 * d.F) * lanes + widest_quantity(d);
 }
 static int widest_quantity(const Dims& d) {
   return up(
@@ -137,6 +141,8 @@ static RowInputs<P> row_inputs(const Dims& d, T* at) {
   f.end = at, at += d.F * P::W;
   f.delta = at, at += d.C * P::W;
   f.last = at, at += d.C * P::W;
+  f.level_gain = at, at += d.trend ? d.C * P::W : 0;
+  f.slope_gain = at, at += d.trend ? d.C * P::W : 0;
   f.zeros = at;
   zero(f.zeros, widest_quantity(d));
   return f;
@@ -191,6 +197,8 @@ static NOINLINE void gather(const Job<T>& job, const Dims& d, const Block& b, in
   many(job.inputs.decay_end, d.F, f.end);
   many(job.inputs.delta, d.C, f.delta);
   many(job.inputs.last, d.C, f.last);
+  many(job.inputs.level_gain, d.C, f.level_gain);
+  many(job.inputs.slope_gain, d.C, f.slope_gain);
   f.mean = job.inputs.mean;
 }
 
@@ -200,6 +208,34 @@ static INLINE V clip(V a) {
 }
 static INLINE V inside(V a) {  // derivative of clip
   return a >= T(0) ? (a <= LARGEST_EXPONENT ? splat(1) : splat(0)) : splat(0);
+}
+
+// Of the trend of each channel: its parameters, and what a step from node to node does.
+struct Trend {
+  const T *damping, *odds, *factor, *kept, *reach, *bend;
+};
+// Over a time `span`, x moves by `reach` times v, and v is multiplied by `kept`. `bend` is the
+// derivative of -reach by the damping.
+struct Motion {
+  V kept, reach, bend;
+};
+static INLINE Motion motion(V damping, V span) {
+  // (1 - exp(-z)) / z and minus its derivative; near 0, where they cancel, by their series.
+  constexpr int TERMS = sizeof(T) == 4 ? 8 : 14;
+  const V z = damping * span, close = z < T(0.5) ? z : splat(0), away = z < T(0.5) ? splat(1) : z;
+  V phi = splat(0), psi = splat(0);
+  T last = 1;  // (TERMS + 1)!
+  for (int m = 2; m <= TERMS + 1; ++m) last *= T(m);
+  for (int m = TERMS - 1; m >= 0; --m) {
+    const T sign = m % 2 ? T(-1) : T(1);
+    psi = fma(psi, close, splat(sign * T(m + 1) / last));  // of (m + 2)!
+    last /= T(m + 2);
+    phi = fma(phi, close, splat(sign / last));  // of (m + 1)!
+  }
+  const V kept = exp_(-z), far = (1 - kept) / away;
+  phi = z < T(0.5) ? phi : far;
+  psi = z < T(0.5) ? psi : (far - kept) / away;
+  return {kept, span * phi, span * span * psi};
 }
 
 template <class P>
@@ -212,21 +248,34 @@ struct Context {
   T* work;                                  // scratch: a layer, then the slopes of the stages
   int lanes = P::W;                         // lanes in use; the others are padding
   const T *low = nullptr, *high = nullptr;  // of the driven units of a bounded scan
+  const Trend trend = {};
 };
 
 // The range of the driven units, laid out as a state.
 template <class P>
 static void range(const Spec& s, const Dims& d, const T* low, const T* high, T* out) {
   if (!s.bounded) return;
-  const int x = P::pad(d.A), n = x + P::pad(d.H);
+  const int x = P::pad(d.X), n = x + P::pad(d.H);
   for (int u = 0; u < n; ++u) {
-    const bool channel = u < d.A;
+    const bool channel = u < d.X;
     out[u] = channel ? low[u] : -HIDDEN_LIMIT;
     out[n + u] = channel ? high[u] : HIDDEN_LIMIT;
   }
 }
 static int range_size(const Spec& s, const Dims& d) {
-  return s.bounded ? 2 * (up(d.A, VW) + up(d.H, VW)) : 0;
+  return (s.bounded ? 2 * (up(d.X, VW) + up(d.H, VW)) : 0) + 3 * (d.trend ? up(d.A, VW) : 0);
+}
+// The trend of a scan; `constants` has room for three vectors of channels.
+static Trend trend(const Spec& s, const Dims& d, const T* packed, T* constants) {
+  if (!d.trend) return {};
+  const int n = up(d.A, VW);
+  for (int u = 0; u < n; u += VW) {
+    const Motion m = motion(load<T>(packed + u), splat(T(s.max_step)));
+    store<T>(constants + u, m.kept);
+    store<T>(constants + n + u, m.reach);
+    store<T>(constants + 2 * n + u, m.bend);
+  }
+  return {packed, packed + n, packed + 2 * n, constants, constants + n, constants + 2 * n};
 }
 // x inside of the range from `low` to `high`.
 static INLINE V within(V x, V low, V high) {

@@ -2,7 +2,8 @@
 // `row_forward` as a batch, with vectors over units in place of lanes.
 
 static int64_t stream_inputs_size(const Dims& d) {
-  return ROW_SCALARS * VW + 4 * up(d.C, VW) + up(d.time_inputs, VW) + 2 * up(d.F, VW) + up(d.C, VW);
+  return ROW_SCALARS * VW + (d.trend ? 6 : 4) * up(d.C, VW) + up(d.time_inputs, VW) +
+         2 * up(d.F, VW) + up(d.C, VW);
 }
 static int64_t stream_scratch(const Spec& s) {
   const Dims d = dims(s);
@@ -41,6 +42,10 @@ static void stream_row(const StreamRow<T>& row) {
   f.delta = padded(row.delta, d.C);
   f.last = padded(row.last, d.C);
   f.mean = padded(row.mean, d.C);
+  if (d.trend) {
+    f.level_gain = padded(row.level_gain, d.C);
+    f.slope_gain = padded(row.slope_gain, d.C);
+  }
   f.active = d.cell && row.update != 0;
   f.use_prediction = row.use_prediction && s.decoder.layers;
 
@@ -53,10 +58,18 @@ static void stream_row(const StreamRow<T>& row) {
   T* work = take(work_size<One>(s));
   T* limits = take(range_size(s, d));
   range<One>(s, d, row.low, row.high, limits);
-  const Context<One> c{
-      s, p,      row.packed,        row.packed + p.stream - 2 * up(d.C, VW), l, work,
-      1, limits, limits + l.network};
-  const int64_t place[3] = {0, l.h_at, l.c_at}, width[3] = {d.A, d.H, d.lstm ? d.H : 0};
+  const Context<One> c{s,
+                       p,
+                       row.packed,
+                       row.packed + p.stream - 2 * up(d.C, VW),
+                       l,
+                       work,
+                       1,
+                       limits,
+                       limits + l.network,
+                       trend(s, d, row.packed + p.stream_trend,
+                             limits + range_size(s, d) - 3 * up(d.A, VW))};
+  const int64_t place[3] = {0, l.h_at, l.c_at}, width[3] = {d.X, d.H, d.lstm ? d.H : 0};
   auto unpadded = [&](const T* from, T* to) {
     for (int k = 0; k < 3; ++k)
       for (int64_t i = 0; i < width[k]; ++i) *to++ = from[place[k] + i];

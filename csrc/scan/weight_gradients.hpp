@@ -112,6 +112,7 @@ static void reduce(const Spec& s, const T* sums, int n, T* flat) {
   for (int slot = 0; slot < n; ++slot, sums += p.sums) {
     for (int i = 0; i < M_END; ++i)
       if (p.used[i]) reduce_matrix(p.m[i], sums, flat);
+    if (s.trend) reduce_lanes(sums + p.trend_sum, 3 * p.d.A, flat + p.trend_weight);
     if (!s.input_decay) continue;
     reduce_lanes(sums + p.input_decay_weight_sum, p.d.C, flat + p.input_decay_weight);
     reduce_lanes(sums + p.input_decay_bias_sum, p.d.C, flat + p.input_decay_bias);

@@ -1,10 +1,11 @@
 // Sizes of a scan, its matrices, and how their weights are packed: part of Scan<T> (scan.hpp).
 
 struct Dims {
-  // Channels, hidden units, anchored channels, decay features, time inputs, cell inputs, gates,
-  // state, driven units (those that the vector field changes).
-  int C, H, A, F, time_inputs, I, G, S, D;
-  bool cell, lstm;
+  // Channels, hidden units, anchored channels, units of the state before h (anchored channels and
+  // their slopes), decay features, time inputs, cell inputs, gates, state, driven units (those that
+  // the vector field changes).
+  int C, H, A, X, F, time_inputs, I, G, S, D;
+  bool cell, lstm, trend;
 };
 static Dims dims(const Spec& s) {
   Dims d{};
@@ -14,8 +15,10 @@ static Dims dims(const Spec& s) {
   d.lstm = s.cell == CELL_LSTM;
   d.I = d.cell ? 2 * d.C + d.time_inputs : 0;
   d.G = !d.cell ? 0 : d.H * (s.cell == CELL_GRU ? 3 : d.lstm ? 4 : 1);
-  d.S = d.A + d.H + (d.lstm ? d.H : 0);
-  d.D = d.A + d.H;
+  d.trend = s.trend;
+  d.X = d.trend ? 2 * d.A : d.A;
+  d.S = d.X + d.H + (d.lstm ? d.H : 0);
+  d.D = d.X + d.H;
   return d;
 }
 static int up(int n, int m) { return (n + m - 1) / m * m; }
@@ -54,6 +57,8 @@ struct Map {
   int64_t packed = 0, sums = 0, recurrent_bias_sum = 0, input_decay_weight_sum = 0,
           input_decay_bias_sum = 0, stream = 0;
   int64_t packed_vectors = 0;
+  // Vectors of the trend, one after the other: damping, odds, factor.
+  int64_t trend_weight = -1, packed_trend = 0, trend_sum = 0, stream_trend = 0;
 };
 
 static constexpr int TILE = 4;
@@ -103,14 +108,15 @@ static NOINLINE Map map(const Spec& s) {
     p.input_decay_weight = at, at += d.C;
     p.input_decay_bias = at, at += d.C;
   }
+  if (d.trend) p.trend_weight = at, at += 3 * d.A;
   for (int k = 0; k < 2; ++k) {
     const Perceptron& net = k ? s.decoder : s.field;
     for (int l = 0; l < net.layers; ++l) {
       Matrix& m =
           add((k ? M_DECODER : M_FIELD) + l, net.sizes[l + 1], net.sizes[l], true, net.sizes[l]);
       m.bias = at, at += m.out;
-      if (!k && d.A && l == 0) m.in_split = d.A;
-      if (!k && d.A && l == net.layers - 1) m.splits = 2, m.split[0] = d.A, m.split[1] = d.H;
+      if (!k && d.A && l == 0) m.in_split = d.X;
+      if (!k && d.A && l == net.layers - 1) m.splits = 2, m.split[0] = d.X, m.split[1] = d.H;
     }
   }
   p.flat = at;
@@ -133,6 +139,11 @@ static NOINLINE Map map(const Spec& s) {
     packed += 2 * up(d.C, VW);
     p.input_decay_weight_sum = sums, sums += int64_t(d.C) * VW;
     p.input_decay_bias_sum = sums, sums += int64_t(d.C) * VW;
+  }
+  if (d.trend) {
+    p.stream_trend = stream, stream += 3 * up(d.A, VW);
+    p.packed_trend = packed, packed += 3 * up(d.A, VW);
+    p.trend_sum = sums, sums += int64_t(3) * d.A * VW;
   }
   p.packed = packed, p.sums = sums;
   p.stream = stream + (s.input_decay ? 2 * up(d.C, VW) : 0);
@@ -166,6 +177,14 @@ static void pack(const Spec& s, const T* flat, T* packed) {
   for (int i = 0; i < M_END; ++i)
     if (p.used[i]) pack_matrix(p.m[i], flat, packed);
   if (s.input_decay) pack_input_decay(p, flat, packed + p.packed_vectors);
+  if (s.trend) pack_trend(p, flat, packed + p.packed_trend);
+}
+// Padding is 1, so that all arithmetic on it is finite.
+static void pack_trend(const Map& p, const T* flat, T* out) {
+  const int n = up(p.d.A, VW);
+  for (int k = 0; k < 3; ++k)
+    for (int c = 0; c < n; ++c)
+      out[k * n + c] = c < p.d.A ? flat[p.trend_weight + k * p.d.A + c] : T(1);
 }
 static void pack_input_decay(const Map& p, const T* flat, T* out) {
   const int n = up(p.d.C, VW);
@@ -197,4 +216,5 @@ static void stream_pack(const Spec& s, const T* flat, T* packed) {
   for (int i = 0; i < M_END; ++i)
     if (p.used[i]) stream_pack_matrix(p.m[i], flat, packed);
   if (s.input_decay) pack_input_decay(p, flat, packed + p.stream - 2 * up(p.d.C, VW));
+  if (s.trend) pack_trend(p, flat, packed + p.stream_trend);
 }

@@ -17,7 +17,8 @@ class ModelConfig:
 
     Attributes:
         name: id of the zoo's entry: `rnn`, `lstm`, `gru`, `rnn_decay`, `gru_d`, `neural_ode`,
-            `ode_rnn`, `ode_gru_d`, `anchored_ode_gru_d`.
+            `ode_rnn`, `ode_gru_d`, `anchored_ode_gru_d`, `anchored_trend`,
+            `anchored_trend_large`.
         hidden_size: units of the hidden state h.
         head: the map from a state to a prediction, and its loss: `point`, the expected value and
             the mean squared error; `gaussian`, a mean and a standard deviation and the negative
@@ -55,6 +56,10 @@ class ModelConfig:
             `observed_rows`, the state decays only where it is updated.
         input_decay: gamma_x, last values that decay to the training mean (equation 27).
         anchored: the state holds the channels themselves, and an observation sets them.
+        trend: an anchored state also holds the slopes of the channels. At the start of training the
+            model is a Kalman filter with damped velocity per channel, tuned on the training data:
+            noise is filtered, and a slope continues. The vector field, damping and gains are
+            learned from there.
         update_rows: `observed`, the cell acts where any channel is observed; `every`, at all rows.
         time_input: the time input of a cell without decay: `elapsed` since the last observed row,
             `delta` since each channel's last observation (equation 25), `gap` since the row before,
@@ -100,6 +105,7 @@ class ModelConfig:
     decay_rows: Literal["continuous", "every_row", "observed_rows"] | None = None
     input_decay: bool | None = None
     anchored: bool | None = None
+    trend: bool | None = None
     update_rows: Literal["observed", "every"] | None = None
     time_input: Literal["none", "elapsed", "delta", "gap"] | None = None
     time_input_unit: Literal["gap", "longest"] | None = None
@@ -123,7 +129,7 @@ class ModelConfig:
             _check(self, name, lambda v: isinstance(v, int) and v >= 1, "an integer of at least 1")
         for name in ("max_step", "rtol", "atol", "typical_gap"):
             _check(self, name, lambda v: 0 < v < math.inf, "a positive number")
-        for name in ("reset_after", "input_decay", "anchored", "bounded"):
+        for name in ("reset_after", "input_decay", "anchored", "trend", "bounded"):
             value = getattr(self, name)
             if not (value is None or isinstance(value, bool)):
                 raise InputError(f"{name} must be true or false, got {value!r}")

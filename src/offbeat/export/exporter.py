@@ -149,13 +149,14 @@ class StreamStep(Step):
     def __init__(self, model: Model) -> None:
         super().__init__(model.channels)
         self.model = model
+        self.parts = (*STATE, "covariance") if model.spec.trend else STATE
         self.register_buffer("shift", torch.tensor(model.scaler.shift)[None])
         self.register_buffer("scale", torch.tensor(model.scaler.scale)[None])
 
     def initial(self) -> dict[str, Tensor]:
         """See `Step`."""
         past = self.model.empty_state(1)
-        return {name: getattr(past, name).detach().cpu().clone() for name in STATE}
+        return {name: getattr(past, name).detach().cpu().clone() for name in self.parts}
 
     def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Prediction and next state.
@@ -163,7 +164,7 @@ class StreamStep(Step):
         Args:
             t: (1,) float64, s.
             values: (1, channels) float64, original units, NaN where not measured.
-            *state: the parts named in `STATE`, as in `RecurrentState`.
+            *state: the parts named in `parts`, as in `RecurrentState`.
         """
         with _ExactNumbers():
             scaled = ((values - self.shift) / self.scale).to(self.model.dtype)
@@ -171,12 +172,12 @@ class StreamStep(Step):
             scaled = torch.where(mask, scaled, torch.zeros_like(scaled))[:, None]
             mask, valid = mask[:, None], torch.ones_like(t[:, None], dtype=torch.bool)
             row = Batch(t[:, None], scaled, mask, mask, valid, self.model.roles)
-            given: dict[str, Any] = dict(zip(STATE, state, strict=True))
+            given: dict[str, Any] = dict(zip(self.parts, state, strict=True))
             past = RecurrentState(**given)
             output = self.model(row, past=past)
             prediction = output.mean[:, 0].double() * self.scale + self.shift
             # An output that is also an input would be missing in the graph.
-            return prediction, *(getattr(output.past, name).clone() for name in STATE)
+            return prediction, *(getattr(output.past, name).clone() for name in self.parts)
 
 
 class CorrectedStep(Step):
@@ -202,8 +203,9 @@ class CorrectedStep(Step):
 
     def forward(self, t: Tensor, values: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Prediction and next state, as of `StreamStep`, and then those of the baseline."""
-        model, own = self.model, state[len(STATE) :]
-        mean, *after = self.inner(t, values, *state[: len(STATE)])
+        count = len(self.inner.parts)
+        model, own = self.model, state[count:]
+        mean, *after = self.inner(t, values, *state[:count])
         with _ExactNumbers():
             past = _nested(self.empty(), own)
             shift, scale = self.inner.shift, self.inner.scale

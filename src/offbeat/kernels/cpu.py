@@ -55,6 +55,7 @@ _ACTIVATIONS = {"tanh": 0, "silu": 1}
 _DECAY_ROWS = {"continuous": 0, "every_row": 1, "observed_rows": 2}
 _TYPES = {torch.float32: "f32", torch.float64: "f64"}
 _MOST_LAYERS = 16
+_OF_TREND = ("level_gain", "slope_gain")
 
 
 _threads: ContextVar[int | None] = ContextVar("offbeat_threads", default=None)
@@ -91,6 +92,11 @@ def instruction_sets() -> list[str]:
     return list(compiled.instruction_sets()) if compiled is not None else []
 
 
+def has_trends() -> bool:
+    """Whether the compiled module is there, and not of a version without trends."""
+    return hasattr(compiled, "filter_gains")
+
+
 def suffix(dtype: torch.dtype) -> str:
     """Suffix of a dtype in names of the compiled module."""
     return _TYPES[dtype]
@@ -106,6 +112,8 @@ def supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | 
         return f"the vector field {spec.field_kind!r} is not mlp"
     if spec.field and tableau(spec.solver).adaptive:
         return f"the solver {spec.solver} chooses its own steps"
+    if spec.trend and not has_trends():
+        return "it was built without trends; build it again"
     if spec.field and spec.adjoint:
         return "gradients are computed by the adjoint method"
     if max(len(spec.field), len(spec.decoder)) > _MOST_LAYERS + 1:
@@ -168,10 +176,11 @@ def scan(
 def compiled_spec(spec: ScanSpec) -> Any:
     """The compiled module's form of a spec."""
     scheme = tableau(spec.solver)
+    further = {"trend": True} if spec.trend else {}  # a module of 0.2 does not know it
     return compiled.Spec(
         channels=spec.channels,
         hidden=spec.hidden_size,
-        anchored=spec.anchors,
+        anchored=spec.channels if spec.anchored else 0,
         time_inputs=spec.time_inputs,
         cell=_CELLS[spec.cell],
         reset_after=spec.reset_after,
@@ -188,6 +197,7 @@ def compiled_spec(spec: ScanSpec) -> Any:
         decay_rows=_DECAY_ROWS[spec.decay_rows],
         input_decay=spec.input_decay,
         decoder=list(spec.decoder),
+        **further,
     )
 
 
@@ -205,10 +215,13 @@ def _inputs(rows: StepInputs | TableSteps, suffix: str) -> Any:
     fed = torch.frombuffer(bytearray(rows.fed), dtype=torch.uint8).numpy() if rows.fed else None
     if isinstance(rows, TableSteps):
         table = rows.table
+        columns = table.columns
+        if not columns[-1][1]:
+            columns = columns[: -len(_OF_TREND)]
         return made(
             _array(table.table),
             _array(rows.index),
-            table.columns,
+            columns,
             rows.rows,
             _array(table.mean),
             fed,
@@ -218,6 +231,7 @@ def _inputs(rows: StepInputs | TableSteps, suffix: str) -> Any:
         )
     names = (*QUANTITIES, "mean", "length", "low", "high")
     given = {name: _array(getattr(rows, name)) for name in names}
+    given = {n: v for n, v in given.items() if v is not None or n not in _OF_TREND}
     return made(**given, use_prediction=fed)
 
 

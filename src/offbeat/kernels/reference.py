@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import factorial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +26,9 @@ from offbeat.kernels.spec import (
     field_tensors,
 )
 from offbeat.ode import Field, solve, tableau
+
+TERMS = 14
+"""Terms of a power series, up to 0.5, to the precision of float64."""
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {"tanh": torch.tanh, "silu": silu}
 """Nonlinearities by name."""
@@ -58,7 +63,7 @@ def scan(
         before.append(arrived)
         updated = arrived
         if parts.cell is not None and gate is not None:
-            observed = (inputs.values[:, i], inputs.mask[:, i]) if spec.anchored else None
+            observed = _Observed.of(spec, inputs, i) if spec.anchored else None
             updated = _update(dynamics, parts.cell, gate, update, observed, arrived)
             updated = updated if valid is None else torch.where(valid, updated, arrived)
         state = updated if nodes is None else torch.where(nodes.commit[i], updated, state)
@@ -94,7 +99,8 @@ def _gates(spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> Tensor | Non
         return None
     shown = _decayed(parts, inputs) if spec.input_decay else inputs.values
     if inputs.low is not None and inputs.high is not None:
-        shown = torch.clamp(shown, inputs.low, inputs.high)
+        each = spec.channels
+        shown = torch.clamp(shown, inputs.low[:each], inputs.high[:each])
     return parts.cell.project(_input(inputs, shown, slice(None)))
 
 
@@ -192,6 +198,8 @@ class _Dynamics:
         high: (driven,) upper bounds.
         numbers: the constants of a step as tensors, for tracing: the exporter rounds numbers inside
             of a loop to single precision.
+        trend: the tensors of `ScanParts.trend`, or None.
+        series: coefficients of (1 - exp(-z)) / z around 0, as numbers or tensors.
     """
 
     spec: ScanSpec
@@ -200,6 +208,8 @@ class _Dynamics:
     low: Tensor | None
     high: Tensor | None
     numbers: Mapping[float, Tensor]
+    trend: tuple[Tensor, Tensor, Tensor] | None = None
+    series: Sequence[Any] = ()
 
     @classmethod
     def of(cls, spec: ScanSpec, parts: ScanParts, inputs: StepInputs) -> _Dynamics:
@@ -210,27 +220,63 @@ class _Dynamics:
             if spec.anchored:
                 low = torch.cat([_given(inputs.low), low])
                 high = torch.cat([_given(inputs.high), high])
+        trend = parts.trend if spec.trend else None
+        series: Sequence[Any] = [(-1.0) ** m / factorial(m + 1) for m in range(TERMS)]
+        if spec.loops:
+            series = [torch.tensor(c, dtype=torch.float64) for c in series]
         if not spec.field:
-            return cls(spec, None, None, low, high, {})
+            return cls(spec, None, None, low, high, {}, trend, series)
         vector_field = parts.field
         if vector_field is None:
             raise ValueError("a vector field needs ScanParts.field")
 
+        # An adaptive solver integrates the trend with the field, so that its error is controlled.
+        within = trend if tableau(spec.solver).adaptive else None
+
         def field(_: Tensor, y: Tensor) -> Tensor:
+            moved = y
             if low is not None and high is not None:
                 y = _clamped(y, low, high)
-            return vector_field(y)
+            slope = vector_field(y)
+            if within is None:
+                return slope
+            v = moved[:, spec.channels : spec.anchors]
+            along = [v, -within[0] * v, torch.zeros_like(moved[:, spec.anchors :])]
+            return slope + torch.cat(along, dim=1)
 
-        parameters = list(field_tensors(vector_field)) if spec.adjoint else None
+        parameters = None
+        if spec.adjoint:
+            parameters = [*field_tensors(vector_field), *(within or ())[:1]]
         numbers = {}
         if spec.loops:
             scheme = tableau(spec.solver)
             each = {w for row in (*scheme.a, scheme.b) for w in row}
             numbers = {w: torch.tensor(w, dtype=torch.float64) for w in each}
-        return cls(spec, field, parameters, low, high, numbers)
+        return cls(spec, field, parameters, low, high, numbers, trend, series)
+
+    def along_trend(self, state: Tensor, span: Tensor) -> Tensor:
+        """The state after a damped trend over (batch, 1) `span`; x does not leave its range.
+
+        The steps are split (Lie), exactly for the trend alone.
+        """
+        if self.trend is None or (self.field and tableau(self.spec.solver).adaptive):
+            return state
+        n, damping = self.spec.channels, self.trend[0]
+        x, v = state[:, :n], state[:, n : 2 * n]
+        z = damping * span
+        kept, near = torch.exp(-z), z < 0.5
+        close: Any = self.series[-1]
+        for c in reversed(self.series[:-1]):
+            close = close * torch.where(near, z, 0.0) + c
+        far = (1.0 - kept) / torch.where(near, 1.0, z)
+        moved = x + span * torch.where(near, close, far) * v
+        if self.low is not None and self.high is not None:
+            moved = _stopped(x, moved, self.low[:n], self.high[:n])
+        return torch.cat([moved, kept * v, state[:, 2 * n :]], dim=1)
 
     def step(self, state: Tensor, span: Tensor) -> Tensor:
         """One step of the solver, or as many as an adaptive one needs, of (batch, 1) `span`."""
+        state = self.along_trend(state, span)
         if self.field is None:
             return state
         spec = self.spec
@@ -265,10 +311,14 @@ class _Dynamics:
         """`moved`, stopped where it leaves the range; outside of it, it can only move back."""
         if self.low is None or self.high is None:
             return moved
-        least = torch.where(state < self.low, state, self.low)
-        most = torch.where(state > self.high, state, self.high)
-        moved = torch.where(moved < least, least, moved)
-        return torch.where(moved > most, most, moved)
+        return _stopped(state, moved, self.low, self.high)
+
+
+def _stopped(old: Tensor, moved: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    least = torch.where(old < low, old, low)
+    most = torch.where(old > high, old, high)
+    moved = torch.where(moved < least, least, moved)
+    return torch.where(moved > most, most, moved)
 
 
 def _clamped(y: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -443,7 +493,7 @@ def _propagate(dynamics: _Dynamics, gap: Tensor, decay: Decay, state: Tensor) ->
         state = _scale_hidden(spec, state, decay)
         decay = None
     if not spec.field:
-        return state
+        return dynamics.along_trend(state, gap)
     driven = spec.anchors + spec.hidden_size
     memory = state[:, driven:]
     state = _solve(dynamics, gap, decay, state[:, :driven])
@@ -459,7 +509,7 @@ def _solve(dynamics: _Dynamics, gap: Tensor, decay: DecayAlongGap | None, state:
     steps: int | Tensor = spec.steps_per_gap
     if spec.max_step is not None:
         steps = torch.ceil(gap / spec.max_step - 1e-6).clamp_min(spec.steps_per_gap).long()
-    if decay is not None or spec.bounded or spec.loops:
+    if decay is not None or spec.bounded or spec.loops or spec.trend:
         return _solve_split(dynamics, gap, decay, state, steps)
     assert dynamics.field is not None
     return solve(
@@ -563,25 +613,55 @@ def _scale_hidden(spec: ScanSpec, state: Tensor, factor: Tensor) -> Tensor:
 # --- at an observation ----------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class _Observed:
+    """The observation of an anchored state at a row; fields as of `StepInputs`."""
+
+    value: Tensor
+    mask: Tensor
+    level_gain: Tensor | None
+    slope_gain: Tensor | None
+
+    @classmethod
+    def of(cls, spec: ScanSpec, inputs: StepInputs, i: int) -> _Observed:
+        gains = (None, None)
+        if spec.trend:
+            gains = _given(inputs.level_gain)[:, i], _given(inputs.slope_gain)[:, i]  # type: ignore[assignment]
+        return cls(inputs.values[:, i], inputs.mask[:, i], *gains)
+
+
 def _update(
     dynamics: _Dynamics,
     cell: ScanCell,
     gate: Tensor,
     update: Tensor,
-    observed: tuple[Tensor, Tensor] | None,
+    observed: _Observed | None,
     state: Tensor,
 ) -> Tensor:
-    """The state after an observation; x of an anchored state takes the observed values."""
+    """The state after an observation; x of an anchored state takes the observed values.
+
+    With a trend, x and v move by gains. Where x or the value is out of range, x takes the value.
+    """
     if observed is None:
         return cell.step(gate, state, update)
-    anchors = dynamics.spec.anchors
-    x, rest = state[:, :anchors], state[:, anchors:]
-    value, mask = observed
+    n, anchors = dynamics.spec.channels, dynamics.spec.anchors
+    x, rest = state[:, :n], state[:, anchors:]
+    value, mask = observed.value, observed.mask
+    shown, expected, outside = value, x, None
+    if dynamics.low is not None and dynamics.high is not None:
+        low, high = dynamics.low[:n], dynamics.high[:n]
+        shown, expected = torch.clamp(value, low, high), _clamped(x, low, high)
+        outside = (mask > 0) & ((shown != value) | (expected != x))
+    innovation = mask * (shown - expected)
     if cell.innovation is not None:
-        shown, expected = value, x
-        if dynamics.low is not None and dynamics.high is not None:
-            low, high = dynamics.low[:anchors], dynamics.high[:anchors]
-            shown, expected = torch.clamp(value, low, high), _clamped(x, low, high)
-        gate = torch.addmm(gate, mask * (shown - expected), cell.innovation.t())
+        gate = torch.addmm(gate, innovation, cell.innovation.t())
     rest = cell.step(gate, rest, update)
-    return torch.cat([torch.lerp(x, value, mask), rest], dim=1)
+    if dynamics.trend is None:
+        return torch.cat([torch.lerp(x, value, mask), rest], dim=1)
+    _, odds, factor = dynamics.trend
+    gain = _given(observed.level_gain)
+    gain = gain / (gain + (1.0 - gain) * odds)
+    if outside is not None:
+        gain = torch.where(outside, 1.0, gain)
+    v = state[:, n:anchors] + _given(observed.slope_gain) * factor * innovation
+    return torch.cat([gain * value + (1.0 - gain) * x, v, rest], dim=1)

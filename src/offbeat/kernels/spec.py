@@ -6,8 +6,8 @@ set. All computations with parameters are inside the scan: those independent of 
 projection of the inputs, decay exponents, x-hat), and the others (innovation, self-feeding, vector
 field, recurrent product).
 
-The state of one trajectory is `[x | h | c]`: `anchored` channels, `hidden_size` hidden units, and
-`memory` further units, which an LSTM needs.
+The state of one trajectory is `[x | v | h | c]`: `anchored` channels, with a `trend` their slopes,
+`hidden_size` hidden units, and `memory` further units, which an LSTM needs.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ class ScanSpec:
         gates: width of the cell's input projection.
         memory: units of c.
         anchored: the channels are part of the state, and an observation sets them.
+        trend: each anchored channel has a slope. Between observations they follow a damped trend,
+            to which each step of the solver is added; an observation moves both by gains.
         reset_after: the GRU's reset gate acts after the recurrent product.
         time_inputs: width of the times since observation that the cell is given; 0 for none.
         field: units of each layer of a perceptron vector field, ends included. A field of another
@@ -80,6 +82,7 @@ class ScanSpec:
     gates: int = 0
     memory: int = 0
     anchored: bool = False
+    trend: bool = False
     reset_after: bool = False
     time_inputs: int = 0
     field: tuple[int, ...] = ()
@@ -102,8 +105,8 @@ class ScanSpec:
 
     @property
     def anchors(self) -> int:
-        """Channels that are part of the state."""
-        return self.channels if self.anchored else 0
+        """Units of x and v: channels that are part of the state, and their slopes."""
+        return (2 if self.trend else 1) * self.channels if self.anchored else 0
 
     @property
     def state_size(self) -> int:
@@ -150,6 +153,8 @@ class ScanParts:
         cell: update of h by an observation; None without one.
         decay: weight (hidden, decay) and bias (hidden,) of the exponents, or None.
         input_decay: weight (channels,) and bias (channels,) of gamma_x, or None.
+        trend: damping of the slopes, per model time, and the corrections of the gains (see
+            `parts.trend`), (channels,) each and positive, or None.
         field: the vector field, or None.
         decoder: layers of the decoder, with self-feeding only.
     """
@@ -157,6 +162,7 @@ class ScanParts:
     cell: ScanCell | None = None
     decay: tuple[Tensor, Tensor] | None = None
     input_decay: tuple[Tensor, Tensor] | None = None
+    trend: tuple[Tensor, Tensor, Tensor] | None = None
     field: ScanField | None = None
     decoder: Layers = ()
 
@@ -164,9 +170,9 @@ class ScanParts:
         """All trained tensors, in the order of the packed buffer."""
         if self.cell is not None:
             yield from self.cell.tensors()
-        for pair in (self.decay, self.input_decay):
-            if pair is not None:
-                yield from pair
+        for group in (self.decay, self.input_decay, self.trend):
+            if group is not None:
+                yield from group
         if self.field is not None:
             yield from field_tensors(self.field)
         for layer in self.decoder:
@@ -201,6 +207,8 @@ QUANTITIES = (
     "first_node",
     "node",
     "commit",
+    "level_gain",
+    "slope_gain",
 )
 """Names of the step inputs, in the order of the compiled code."""
 
@@ -229,8 +237,11 @@ class StepInputs:
         node: (batch, rows) number of the last node before the row.
         commit: (batch, rows) 1.0 where the state of the row is kept, which is where something is
             observed; elsewhere the state of the node is.
-        low: (channels,) lower bounds of the values; with `bounded` and `anchored` only.
-        high: (channels,) upper bounds of the values.
+        level_gain: (batch, rows, channels) part of the innovation that x moves by before its
+            correction, from 0, where nothing is observed, to 1; with a `trend` only.
+        slope_gain: (batch, rows, channels) the same of v, per model time.
+        low: (anchors,) lower bounds of x and v; with `bounded` and `anchored` only.
+        high: (anchors,) upper bounds of x and v.
         mean: (channels,) value that last values decay to; with `input_decay` only.
         length: (batch,) int64, rows of each trajectory; later rows are padding and do not change
             the state. None: all rows count.
@@ -251,6 +262,8 @@ class StepInputs:
     first_node: Tensor | None = None
     node: Tensor | None = None
     commit: Tensor | None = None
+    level_gain: Tensor | None = None
+    slope_gain: Tensor | None = None
     low: Tensor | None = None
     high: Tensor | None = None
     mean: Tensor | None = None

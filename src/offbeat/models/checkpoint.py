@@ -177,7 +177,7 @@ def _build(record: dict[str, Any], weights: dict[str, Tensor]) -> BaseModel:
         return CorrectedModel.restored(parts["inner"], parts["base"], data, weights)
     config = record["model"]
     if "name" in config:  # a composed model, perhaps of a version without these options
-        config = {"nodes": "rows", "bounded": False, **config}
+        config = {"nodes": "rows", "bounded": False, "trend": False, **config}
     return build(record["name"], config, data)
 
 

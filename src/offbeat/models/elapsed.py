@@ -37,6 +37,8 @@ class RecurrentState:
         generator: of self-feeding, or None.
         actions: (batch, channels) values of the last row in channels with the role `action`, NaN
             elsewhere and where there was none; None for a model without such channels.
+        covariance: (batch, channels, 3) float64, of level, level and slope, and slope right after
+            the last observation of each channel (`models.gains`); None for a model without a trend.
     """
 
     state: Tensor
@@ -49,6 +51,7 @@ class RecurrentState:
     rows: int = 0
     generator: torch.Generator | None = None
     actions: Tensor | None = None
+    covariance: Tensor | None = None
 
     @classmethod
     def empty(
@@ -194,7 +197,8 @@ def elapsed_times(
 
     Args:
         batch: rows to come, in order.
-        past: state after the earlier rows; its `state`, `updated` and `actions` are kept.
+        past: state after the earlier rows; its `state`, `updated`, `actions` and `covariance`
+            are kept.
         elapsed_limit: s, at which the time since the last observed row saturates.
         from_first_row: the clock starts at the first row, observed or not.
         ends: whether the second result is the past after the last row; else it is `past`.
@@ -237,6 +241,7 @@ def elapsed_times(
         rows=past.rows + batch.rows,
         generator=past.generator,
         actions=past.actions,
+        covariance=past.covariance,
     )
     return result, ended
 

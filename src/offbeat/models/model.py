@@ -30,9 +30,11 @@ from offbeat.kernels import (
 from offbeat.kernels.spec import MOST_NODES, nodes_before
 from offbeat.models.base import BaseModel, DataInfo
 from offbeat.models.elapsed import ElapsedTimes, RecurrentState, at_last, elapsed_times
+from offbeat.models.gains import Filters
 from offbeat.ode import tableau
 from offbeat.parts import CELLS, FIELDS, HEADS, Cell, HeadShape, Perceptron, Prediction
 from offbeat.parts.decay import ExponentialDecay, InputDecay, TrainableDecay
+from offbeat.parts.trend import Trend
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,14 @@ class Model(BaseModel):
         self.spec = _spec(
             config, channels, self.decay, kind, longest=self.elapsed_limit / self.time_unit
         )
-        anchored = self.spec.anchors
+        anchored = channels if self.spec.anchored else 0
+        self.trend = Trend(channels) if self.spec.trend else None
+        self.filters = Filters.of(statistics.filters)
+        if self.trend is not None and len(statistics.filters) != channels:
+            raise InputError(
+                f"a model with a trend needs a filter for each of its {channels} channels in the "
+                f"statistics, got {len(statistics.filters)}; offbeat.make_model tunes them"
+            )
         self.cell = kind(
             2 * channels + self.spec.time_inputs,
             hidden,
@@ -111,6 +120,7 @@ class Model(BaseModel):
             mean=self.mean.clone(),
             std=self.std.clone(),
             actions=tuple(i for i, role in enumerate(self.roles) if role == ACTION),
+            trend=self.spec.trend,
         )
         self.head = HEADS[config.head or "point"](shape)
         low, high = self._range()
@@ -119,7 +129,11 @@ class Model(BaseModel):
         self._initialise(seed)
 
     def _range(self) -> tuple[Tensor, Tensor]:
-        """(channels,) bounds of the values, in the units that the cell is given them in."""
+        """(channels,) bounds of the values, in the units that the cell is given them in.
+
+        With a trend, (2 channels,): a slope is within its bounds if it crosses the range of its
+        channel in no less than a typical gap.
+        """
         infinite = torch.full((self.channels,), torch.inf)
         if not self.spec.bounded:
             return -infinite, infinite
@@ -135,6 +149,9 @@ class Model(BaseModel):
                 for v in (self.statistics.mean, self.statistics.std)
             )
             low, high = (low - mean) / std, (high - mean) / std
+        if self.spec.trend:
+            slope = (high - low) / float(self.config.typical_gap or 1)
+            low, high = torch.cat([low, -slope]), torch.cat([high, slope])
         return low.to(self.mean.dtype), high.to(self.mean.dtype)
 
     def _initialise(self, seed: int) -> None:
@@ -154,6 +171,10 @@ class Model(BaseModel):
                 self.field.weights[-1].mul_(0.1)
             if self.start is not None:
                 self.start.zero_()
+            if self.trend is not None:
+                self.trend.begin(self.filters.damping(self.time_unit))
+                if isinstance(self.field, Perceptron):
+                    self.field.weights[-1][: self.spec.anchors].zero_()
 
     @property
     def dtype(self) -> torch.dtype:
@@ -203,7 +224,11 @@ class Model(BaseModel):
         """
         if generator is None and self.config.self_feeding:
             generator = torch.Generator().manual_seed(0)
-        return RecurrentState.empty(self.first_state(batch), self.mean, generator=generator)
+        empty = RecurrentState.empty(self.first_state(batch), self.mean, generator=generator)
+        if self.trend is not None:
+            prior = self.filters.prior().to(self.mean.device)
+            empty = replace(empty, covariance=prior.expand(batch, -1, -1))
+        return empty
 
     def backend(self) -> tuple[str, str]:
         """The variant of the scan's backend that runs this model, and the reason."""
@@ -216,7 +241,8 @@ class Model(BaseModel):
         Args:
             batch: number of trajectories.
         """
-        state = self.cell.bias.new_zeros(self.spec.state_size - self.spec.anchors)
+        known = 0 if self.start is None else len(self.start)
+        state = self.cell.bias.new_zeros(self.spec.state_size - known)
         if self.start is not None:
             state = torch.cat([self.start, state])
         return state.expand(batch, -1)
@@ -305,6 +331,7 @@ class Model(BaseModel):
             cell=self.cell,
             decay=self.decay.weights() if self.decay is not None else None,
             input_decay=self.input_decay.weights() if self.input_decay is not None else None,
+            trend=self.trend.weights() if self.trend is not None else None,
             field=self.field,
             decoder=self.head.layers if self.spec.decoder else (),
         )
@@ -371,6 +398,18 @@ class Model(BaseModel):
             gap, first, node = self._nodes(at_rows)
             commit = at_rows.observed.to(dtype)
             rows = replace(rows, gap=gap, first_node=first, node=node, commit=commit)
+        if spec.trend:
+            assert past.covariance is not None
+            level, slope, covariance = self.filters.to(mask.device).gains(
+                at_rows.delta,
+                mask,
+                past.channel_at > -torch.inf,
+                past.covariance,
+                unit=unit,
+                dtype=dtype,
+            )
+            rows = replace(rows, level_gain=level, slope_gain=slope)
+            ended = replace(ended, covariance=covariance)
         delta = (at_rows.delta / unit).to(dtype) if spec.decay or spec.input_decay else None
         if spec.input_decay:
             rows = replace(rows, delta=delta, last=last, mean=self.mean)
@@ -444,13 +483,14 @@ def _spec(
     longest: float,
 ) -> ScanSpec:
     hidden = int(config.hidden_size or 1)
-    driven = hidden + (channels if config.anchored else 0)
+    driven = hidden + (channels if config.anchored else 0) * (2 if config.trend else 1)
     decay_rows = config.decay_rows or "continuous"
     if decay_rows == "every_row" and not isinstance(decay, TrainableDecay):
         decay_rows = "continuous"  # for elapsed time both are the same
     kind = config.vector_field or "none"
     adaptive = tableau(config.solver or "euler").adaptive  # raises an error for an unknown one
-    nodes = config.nodes == "observations" and (kind != "none" or decay is not None)
+    moves = kind != "none" or decay is not None or bool(config.trend)
+    nodes = config.nodes == "observations" and moves
     max_step = config.max_step
     if nodes:
         default = float(config.typical_gap or 1) / (config.steps_per_gap or 1)
@@ -469,6 +509,7 @@ def _spec(
         gates=cell.gates_per_unit * hidden,
         memory=cell.memory_per_unit * hidden,
         anchored=bool(config.anchored),
+        trend=bool(config.trend),
         reset_after=bool(config.reset_after) and cell.takes_reset_after,
         time_inputs={"none": 0, "elapsed": 1, "gap": 1, "delta": channels}[
             config.time_input or "none"
@@ -552,5 +593,7 @@ def _check(config: ModelConfig) -> None:
         )
     if config.self_feeding and config.head != "point":
         raise InputError(f"self_feeding needs the head 'point', got {config.head!r}")
+    if config.trend and not config.anchored:
+        raise InputError("trend is an option of anchored models; set anchored=True, too")
     if config.anchored and config.input_decay:
         raise InputError("an anchored state holds the channels: leave input_decay off")

@@ -28,6 +28,8 @@ class Statistics:
         rows: of the longest training trajectory; 0 in checkpoints of 0.1.
         low: per channel, smallest observed value, 0 without one; empty in checkpoints up to 0.2.
         high: per channel, largest observed value, 0 without one.
+        filters: per channel, the Kalman filter that a model with a trend begins as, see
+            `models.gains.Filters`; empty for other models.
     """
 
     mean: tuple[float, ...]
@@ -38,6 +40,7 @@ class Statistics:
     rows: int = 0
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
+    filters: tuple[tuple[float, float, float, float], ...] = ()
 
     @property
     def channels(self) -> int:
@@ -106,6 +109,7 @@ class Statistics:
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in value.items()
         }
+        fields["filters"] = tuple(tuple(each) for each in fields.get("filters", ()))
         return cls(**fields)
 
 

@@ -1,6 +1,7 @@
 """The zoo: models as choices of parts with training recipes.
 
-These are the models of table 2.1 of the thesis. `register_model` adds others.
+These are the models of table 2.1 of the thesis, and anchored models with a trend. `register_model`
+adds others.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError, one_of
 from offbeat.models.base import BaseModel, DataInfo
 from offbeat.models.foreign import ForeignModel
+from offbeat.models.gains import tune_filters
 from offbeat.models.model import Model, depends_on_rows
 from offbeat.models.statistics import Statistics
 from offbeat.registry import Registry
@@ -44,6 +46,7 @@ _COMMON: dict[str, Any] = {
     "decay_rows": "continuous",
     "input_decay": False,
     "anchored": False,
+    "trend": False,
     "update_rows": "observed",
     "time_input": "none",
     "time_input_unit": "gap",
@@ -57,6 +60,16 @@ _COMMON: dict[str, Any] = {
 }
 """Sizes and initial weights of the thesis (chapter 3, after Rubanova et al. 2019)."""
 
+_ANCHORED: dict[str, Any] = {
+    "vector_field": "mlp",
+    "anchored": True,
+    "hidden_size": 32,
+    "field_units": (100, 100, 100),
+    "activation": "silu",
+    "init": "fan_in",
+    "typical_gap": 0.3,
+}
+
 ZOO: dict[str, dict[str, Any]] = {
     "rnn": {"cell": "elman", "time_input": "elapsed"},
     "lstm": {"cell": "lstm", "time_input": "elapsed"},
@@ -66,14 +79,13 @@ ZOO: dict[str, dict[str, Any]] = {
     "neural_ode": {"cell": "none", "vector_field": "mlp"},
     "ode_rnn": {"vector_field": "mlp"},
     "ode_gru_d": {"decay": "trainable", "input_decay": True, "vector_field": "mlp"},
-    "anchored_ode_gru_d": {
-        "vector_field": "mlp",
-        "anchored": True,
-        "hidden_size": 32,
-        "field_units": (100, 100, 100),
-        "activation": "silu",
-        "init": "fan_in",
-        "typical_gap": 0.3,
+    "anchored_ode_gru_d": _ANCHORED,
+    "anchored_trend": {**_ANCHORED, "trend": True},
+    "anchored_trend_large": {
+        **_ANCHORED,
+        "trend": True,
+        "hidden_size": 64,
+        "field_units": (256, 256, 256),
     },
 }
 """Options of each model that differ from the common choice."""
@@ -143,6 +155,8 @@ for _name, _options in ZOO.items():
     # An anchored state is the prediction itself, so a bad step affects all later ones:
     # it needs Adam, cosine decay and clipped gradients.
     _recipe = _ANCHORED_RECIPE if _options.get("anchored") else _THESIS_RECIPE
+    if _name == "anchored_trend_large":
+        _recipe = {**_recipe, "learning_rate": 0.0015}
     MODELS.register(_name, ModelEntry(_options, _recipe))
 
 
@@ -310,7 +324,11 @@ def make_model(
     config = ModelConfig(name=model) if isinstance(model, str) else model
     for key in options:
         one_of("model option", key, [f.name for f in fields(config)])
-    return Model(resolve(replace(config, **options)), _info(train, scaler), seed=seed)
+    config, info = resolve(replace(config, **options)), _info(train, scaler)
+    if config.trend:
+        filters = tune_filters(train)
+        info = replace(info, statistics=replace(info.statistics, filters=filters))
+    return Model(config, info, seed=seed)
 
 
 def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:

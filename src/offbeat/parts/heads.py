@@ -34,6 +34,7 @@ class HeadShape:
         channels: width of the prediction.
         hidden_size: units of h.
         anchored: the state begins with the channels, in units of `std` around `mean`.
+        trend: the slopes of the channels follow.
         units: hidden layers of the head's perceptron.
         mean: (channels,) training mean, scaled units.
         std: (channels,) training standard deviation, scaled units.
@@ -47,6 +48,12 @@ class HeadShape:
     mean: Tensor
     std: Tensor
     actions: tuple[int, ...] = ()
+    trend: bool = False
+
+    @property
+    def anchors(self) -> int:
+        """Units of the state before h."""
+        return (2 if self.trend else 1) * self.channels if self.anchored else 0
 
 
 class Head(nn.Module):
@@ -62,14 +69,14 @@ class Head(nn.Module):
     def __init__(self, shape: HeadShape) -> None:
         super().__init__()
         self.channels, self.hidden_size = shape.channels, shape.hidden_size
-        self.anchored = shape.anchored
+        self.anchored, self.anchors = shape.anchored, shape.anchors
         self.register_buffer("mean", shape.mean, persistent=False)
         self.register_buffer("std", shape.std, persistent=False)
         # An observation sets its channels of x, and only h is updated with weights: actions
         # are decoded from x and h together.
         self.actions, self.policy = list(shape.actions), None
         if shape.anchored and shape.actions:
-            width = shape.channels + shape.hidden_size
+            width = shape.anchors + shape.hidden_size
             self.policy = Perceptron((width, *shape.units, len(shape.actions)), "tanh")
 
     def decode(self, state: Tensor) -> Prediction:
@@ -96,8 +103,7 @@ class Head(nn.Module):
 
     def hidden(self, state: Tensor) -> Tensor:
         """(..., hidden) h of a state."""
-        first = self.channels if self.anchored else 0
-        return state[..., first : first + self.hidden_size]
+        return state[..., self.anchors : self.anchors + self.hidden_size]
 
     def anchored_values(self, state: Tensor) -> Tensor:
         """(..., channels) the channels of an anchored state, in scaled units.
@@ -106,7 +112,7 @@ class Head(nn.Module):
         """
         x = state[..., : self.channels]
         if self.policy is not None:
-            driven = state[..., : self.channels + self.hidden_size]
+            driven = state[..., : self.anchors + self.hidden_size]
             chosen = perceptron(self.policy.layers, driven, "tanh")
             x = x.index_copy(-1, torch.tensor(self.actions, device=x.device), chosen)
         return x * self.std + self.mean

@@ -44,6 +44,8 @@ STYLES: dict[str, Style] = {
     "ode_rnn": Style("ODE-RNN", "#009E73", "^", _DASHED),
     "ode_gru_d": Style("ODE-GRU-D", "#0072B2", "D", (0, (6, 1.2, 1, 1.2, 1, 1.2))),
     "anchored_ode_gru_d": Style("Anchored ODE-GRU-D", "#D55E00", "o"),
+    "anchored_trend": Style("Anchored trend", "#EE3377", "s"),
+    "anchored_trend_large": Style("Anchored trend, large", "#0077BB", "^"),
     "rnn_decay": Style("RNN-Decay", "#AA4499", "v", _DASH_DOT),
     "rnn": Style("RNN", "#DDCC77", "P", _DOTTED),
     "lstm": Style("LSTM", "#332288", "X", _DOTTED),

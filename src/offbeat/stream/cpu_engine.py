@@ -36,6 +36,10 @@ class CpuEngine(Engine):
         if layers := model.head.layers:
             decoder = [layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers)]
             decoder_weights = _flat([t for layer in layers for t in layer])
+        further = {}
+        if spec.trend:
+            filters = model.filters
+            further = {"filters": filters.table.numpy(), "prior": filters.prior().numpy()}
         with torch.no_grad():
             self._live = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")(
                 spec=cpu.compiled_spec(spec),
@@ -58,6 +62,7 @@ class CpuEngine(Engine):
                 every_row=config.update_rows == "every",
                 starts_only=config.cell == "none",
                 exponential=bool(spec.decay) and not isinstance(model.decay, TrainableDecay),
+                **further,
             )
         self._generator: torch.Generator | None = None
         self._kept: list[torch.Tensor | None] = []
@@ -145,6 +150,7 @@ class CpuEngine(Engine):
 
     def _parts(self) -> list[tuple[str, tuple[int, ...], Any]]:
         states, channels = self._model.spec.state_size, self._model.channels
+        trend = [("covariance", (1, channels, 3), np.float64)] if self._model.spec.trend else []
         return [
             ("state", (1, states), self._dtype),
             ("time", (1,), np.float64),
@@ -153,6 +159,7 @@ class CpuEngine(Engine):
             ("channel_at", (1, channels), np.float64),
             ("last", (1, channels), self._dtype),
             ("updated", (1,), np.bool_),
+            *trend,
             ("rows", (), np.int64),
         ]
 
