@@ -30,14 +30,15 @@ RK4: dict[str, Any] = {
 GRU, LSTM = 4, 3
 TANH, SILU = 0, 1
 QUANTITIES = ("gap", "update", "updated", "values", "mask", "time_input", "decay_start",
-              "decay_end", "delta", "last", "first_node", "node", "commit")  # fmt: skip
+              "decay_end", "delta", "last", "first_node", "node", "commit", "level_gain",
+              "slope_gain")  # fmt: skip
 
 
 def make_spec(**changes: Any) -> Any:
     """A spec of a GRU with an Euler step; `units` are the inner layers of its vector field."""
     channels, hidden = changes.get("channels", 2), changes.get("hidden", 3)
     units = changes.pop("units", (4,))
-    driven = hidden + changes.get("anchored", 0)
+    driven = hidden + changes.get("anchored", 0) * (2 if changes.get("trend") else 1)
     options: dict[str, Any] = {
         "channels": channels, "hidden": hidden, "anchored": 0, "time_inputs": 0, "cell": GRU,
         "reset_after": False, "field": [driven, *units, driven], "activation": TANH, **EULER,
@@ -494,6 +495,19 @@ STREAMS: dict[str, tuple[dict[str, Any], str]] = {
     "weights of the wrong size": ({"weights": np.ones(3, np.float32)}, "weights has shape"),
     "a first state of the wrong size": (
         {"first_state": np.ones(4, np.float32)}, "first_state has shape"),
+    "a trend without filters": ({"spec": {"trend": True}}, "filters or prior is None"),
+    "filters of other channels": (
+        {"spec": {"trend": True}, "filters": np.ones((4, 3)), "prior": np.ones((2, 3))},
+        r"filters has shape \(4, 3\), expected \(4, 2\)"),
+    "a clock of 0": (
+        {"spec": {"trend": True}, "filters": np.zeros((4, 2)), "prior": np.ones((2, 3))},
+        "filters has the entry 0"),
+    "filters without end": (
+        {"spec": {"trend": True}, "filters": np.full((4, 2), math.inf), "prior": np.ones((2, 3))},
+        "filters has the entry inf"),
+    "a prior of other channels": (
+        {"spec": {"trend": True}, "filters": np.ones((4, 2)), "prior": np.ones((3, 3))},
+        "prior has shape"),
     "a mean of the wrong size": ({"mean": np.ones(1, np.float32)}, "mean has shape"),
     "an unknown instruction set": ({"name": "mmx"}, "does not run the instruction set 'mmx'"),
 }  # fmt: skip
@@ -506,12 +520,41 @@ def test_a_stream_that_does_not_fit_its_model_is_refused(case: str) -> None:
         make_stream(**changes)
 
 
+GAINS: dict[str, tuple[dict[str, Any], str]] = {
+    "two axes": ({"delta": np.ones((2, 3))}, r"delta has shape \(2, 3\)"),
+    "a mask of other rows": ({"mask": np.ones((2, 4, 2), bool)}, "mask has shape"),
+    "columns with gaps": (
+        {"delta": np.ones((2, 3, 4))[..., ::2]}, "delta is not contiguous"),
+    "started of another batch": ({"started": np.ones((3, 2), bool)}, "started has shape"),
+    "a covariance of two": ({"covariance": np.ones((2, 2, 2))}, "covariance has shape"),
+    "gains of other channels": ({"level": np.ones((2, 3, 1), np.float32)}, "level has shape"),
+    "a negative damping": ({"filters": -np.ones((4, 2))}, "filters has the entry -1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", list(GAINS))
+def test_gains_of_arrays_that_do_not_fit_are_refused(case: str) -> None:
+    changes, message = GAINS[case]
+    given: dict[str, Any] = {
+        "filters": np.ones((4, 2)), "delta": np.ones((2, 3, 2)), "mask": np.ones((2, 3, 2), bool),
+        "started": np.ones((2, 2), bool), "covariance": np.ones((2, 2, 3)),
+        "level": np.ones((2, 3, 2), np.float32), "slope": np.ones((2, 3, 2), np.float32),
+        "unit": 1.0,
+    }  # fmt: skip
+    with pytest.raises(ob.InputError, match=message):
+        compiled.filter_gains(**{**given, **changes})
+
+
 @every_set
-def test_a_stream_takes_any_time_and_value(name: str) -> None:
+@pytest.mark.parametrize("trend", [False, True])
+def test_a_stream_takes_any_time_and_value(name: str, trend: bool) -> None:
+    further: dict[str, Any] = {}
+    if trend:
+        further = {"filters": np.ones((4, 2)), "prior": np.ones((2, 3)), "spec": {"trend": True}}
     wild = (0.0, math.inf, -math.inf, math.nan, 3e38, -3e38, 1e-45)
     mask, out = np.ones(2, bool), np.empty((len(wild), 2))
     for first, second in itertools.product(wild, wild):
-        stream = make_stream(name, every_row=True)
+        stream = make_stream(name, every_row=True, **further)
         for time in (first, second, first):
             stream.observe(time, np.array([second, first], np.float32), mask, True)
             stream.predict(np.array(wild), out)

@@ -101,6 +101,7 @@ def problems(draw: Any, cell: str, flow: str) -> Problem:
         cell=cell,
         flow=flow,
         anchored=anchored,
+        trend=anchored and draw(st.booleans()),
         self_feeding=not anchored and not plain and draw(st.booleans()),
         input_decay=not anchored and cell != "none" and draw(st.booleans()),
         decay=draw(st.sampled_from(["none", "delta", "elapsed"])),
@@ -138,6 +139,11 @@ LARGE = {
         "cell": "gru", "flow": "heun, nodes", "anchored": True, "bounded": True, "decay": "delta",
         "activation": "silu", "units": (19, 23), "batch": 67, "rows": 40, "padded": True,
     },
+    "a trend, nodes": {
+        "cell": "gru", "flow": "euler, nodes", "anchored": True, "trend": True, "bounded": True,
+        "activation": "silu", "units": (37, 41), "hidden": 32, "batch": 67, "rows": 100,
+        "padded": True,
+    },
     "Elman, Heun, one trajectory": {
         "cell": "elman", "flow": "heun", "batch": 1, "rows": 399, "units": (29, 13),
         "time_inputs": 3,
@@ -172,11 +178,12 @@ def test_one_trajectory_may_lie_at_a_node_and_another_between_two(keep: bool) ->
 
 @needs_cpu
 @pytest.mark.parametrize("keep", [True, False], ids=["with a tape", "without a tape"])
-@pytest.mark.parametrize("decay", ["none", "delta"])
+@pytest.mark.parametrize("decay", ["none", "delta", "trend"])
 def test_the_last_steps_of_a_silence_alone_have_a_gradient(decay: str, keep: bool) -> None:
     case = problem(
         seed=5, batch=21, rows=3, channels=2, hidden=3, cell="gru", flow="euler, nodes",
-        decay=decay, bounded=True, anchored=True, units=(4,), scale=0.1, dtype=torch.float64,
+        decay=decay.replace("trend", "none"), bounded=True, anchored=True, trend=decay == "trend",
+        units=(4,), scale=0.1, dtype=torch.float64,
     )  # fmt: skip
     assert case.rows.node is not None
     node = case.rows.node.clone()
@@ -197,6 +204,23 @@ def test_gradients_equal_finite_differences(cell: str) -> None:
     case = problem(
         seed=3, batch=3, rows=4, channels=2, hidden=3, cell=cell, flow="heun", decay="delta",
         input_decay=True, units=(4,), padded=True, dtype=torch.float64,
+    )  # fmt: skip
+    spec, weights, rows, state, _ = case
+    inputs = (*weights.tensors(), state)
+
+    def function(*tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return cpu.scan(spec, case.with_weights(tensors[:-1]), rows, tensors[-1])
+
+    assert torch.autograd.gradcheck(function, inputs, atol=1e-7, rtol=1e-5)
+
+
+@needs_cpu
+@pytest.mark.parametrize("flow", ["none", "heun", "rk4, several steps", "euler, nodes"])
+@pytest.mark.parametrize("bounded", [True, False])
+def test_gradients_of_a_trend_equal_finite_differences(flow: str, bounded: bool) -> None:
+    case = problem(
+        seed=4, batch=3, rows=4, channels=2, hidden=3, cell="gru", flow=flow, anchored=True,
+        trend=True, bounded=bounded, units=(4,), padded=True, dtype=torch.float64,
     )  # fmt: skip
     spec, weights, rows, state, _ = case
     inputs = (*weights.tensors(), state)
@@ -240,6 +264,7 @@ def test_a_compiled_perceptron_equals_the_reference(
 
 BITS = {
     "anchored": {"cell": "gru", "flow": "euler", "anchored": True, "activation": "silu"},
+    "trend": {"cell": "gru", "flow": "euler", "anchored": True, "trend": True},
     "lstm": {"cell": "lstm", "flow": "rk4, several steps", "decay": "delta"},
     "gru_d": {"cell": "gru", "flow": "none", "decay": "delta", "input_decay": True},
     "bounded steps": {"cell": "gru", "flow": "midpoint, longest step", "decay": "elapsed"},
@@ -356,7 +381,7 @@ def cut(rows: StepInputs, lanes: slice, at: slice) -> StepInputs:
     changed: dict[str, Any] = {"length": None}
     for name in ("gap", "update", "values", "mask", "time_input", "updated", "decay_start",
                  "decay_end",
-                 "delta", "last"):  # fmt: skip
+                 "delta", "last", "level_gain", "slope_gain"):  # fmt: skip
         value = getattr(rows, name)
         changed[name] = None if value is None else value[lanes, at]
     return replace(rows, **changed)

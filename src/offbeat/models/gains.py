@@ -26,7 +26,8 @@ from offbeat.data.trajectory import Dataset
 from offbeat.kernels import cpu
 
 TASKS = 256
-"""Tasks that a filter is tuned on where nothing is masked in the training data."""
+"""Trajectories that filters are tuned on, spread evenly over the training data; and tasks, where
+nothing is masked."""
 
 HORIZON = 16
 """Longest forecast of these tasks, in typical gaps."""
@@ -57,6 +58,8 @@ def tune_filters(train: Dataset) -> tuple[tuple[float, float, float, float], ...
         horizon = HORIZON * gap
         window = TaskConfig(horizon_s=horizon, gap_s=gap, window_s=5 * horizon)
         tasks = draw_tasks(train, window, TASKS)
+    if len(tasks) > TASKS:
+        tasks = tasks.take(np.linspace(0, len(tasks) - 1, TASKS).round().astype(np.int64))
     channels = [[c, -1] for c in range(tasks.channels)]
     sample = Sample.of(tasks, np.array(channels), two_sided=False, cells=CELLS)
     mean, scale = moments(tasks)
