@@ -23,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -327,7 +328,11 @@ def _in_processes(name: str, numbers: range, good: Path) -> Iterator[tuple[int, 
 
 
 def _work(name: str, numbers: range, good: Path) -> None:
-    """Prints the outcomes, with an address space that ends above the limit of memory."""
+    """Prints the outcomes, with an address space that ends above the limit of memory.
+
+    Warnings of NumPy are errors: they would be more lines.
+    """
+    warnings.simplefilter("error")
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + 4 * MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (most, most))

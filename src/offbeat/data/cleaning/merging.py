@@ -181,7 +181,8 @@ def _pieces(
                 signal.kinds,
             )
             low, high = part.stamps.min(), part.stamps.max()
-            shared = [min(high, top) - max(low, bottom) for bottom, top in spans]
+            # as floats: stamps may be any integers
+            shared = [float(min(high, top)) - float(max(low, bottom)) for bottom, top in spans]
             at = k if len(cut) == len(cuts[most]) else int(np.argmax(shared))
             pieces[at].append(part)
     return pieces
