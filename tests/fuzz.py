@@ -48,7 +48,7 @@ from offbeat.sweeps.record import Record
 SECONDS, MEMORY, CHARACTERS = 10, 1 << 30, 300
 """Limits of a mutant: its time, its memory in bytes, its message. Paths do not count."""
 
-ROUND = 5000
+ROUND = 2000
 """Mutants of a target before the next target has its turn."""
 
 STAMPS = 1_700_000_000_123_456_000 + 1000 * np.cumsum(

@@ -15,7 +15,9 @@ import importlib
 import itertools
 import json
 import math
+import mmap
 import re
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -131,6 +133,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
     with suppress(ImportError):
         importlib.import_module("hdf5plugin")  # registers filters, where it is installed
+    _check_heaps(path)
     try:
         with h5py.File(path, "r") as file:
             yield file
@@ -142,6 +145,37 @@ def _opened(path: Path) -> Iterator[Any]:
             f"{path} can't be read as HDF5, it is truncated, damaged or of another format "
             f"({what}); copy it again"
         ) from None
+
+
+_HEAP = b"GCOL\1\0\0\0"
+"""Begin of a global heap, which holds texts of any length; lengths and objects follow."""
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuses a global heap with a free space of 0 bytes, in which HDF5 would loop for ever.
+
+    Raises:
+        FileFormatError: the file has one.
+    """
+    with path.open("rb") as file:
+        if not file.read(1):
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            start = data.find(_HEAP)
+            while start >= 0 and start + 16 <= len(data):
+                end = min(start + struct.unpack_from("<Q", data, start + 8)[0], len(data))
+                at, size = start + 16, 1
+                while at + 16 <= end and size:
+                    index, _, size = struct.unpack_from("<HH4xQ", data, at)
+                    if index:
+                        size = 16 + -(-size // 8) * 8
+                    at += size
+                if not size:
+                    raise FileFormatError(
+                        f"{path} is damaged: a heap of its texts has a free space of 0 bytes, at "
+                        f"byte {at}; copy it again"
+                    )
+                start = data.find(_HEAP, start + 8)
 
 
 def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:
