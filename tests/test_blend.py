@@ -63,6 +63,37 @@ def test_a_predictor_that_another_one_contains_gets_no_weight():
     assert on_simplex(np.array([[1.0, 1.0], [1.0, 3.0]])) == pytest.approx([1, 0], abs=1e-6)
 
 
+def test_selection_draws_the_weights_to_the_best_predictor():
+    # (1 - s) (w^2 + 4 (1 - w)^2) + s (w + 4 (1 - w)) is least at
+    # w = (8 (1 - s) + 3 s) / (10 (1 - s))
+    gram = np.diag([1.0, 4.0])
+    assert on_simplex(gram, 0.2) == pytest.approx([7 / 8, 1 / 8], abs=1e-6)
+    assert on_simplex(gram, 0.5) == pytest.approx([1, 0], abs=1e-6)
+    many = on_simplex(np.full((3, 3), 0.5) + 0.5 * np.eye(3), 0.8)
+    assert many == pytest.approx([1 / 3, 1 / 3, 1 / 3], abs=1e-6), "equal ones are averaged"
+
+
+def test_one_large_motion_decides_only_where_there_are_many_like_it():
+    # At rest for 19 of 20 tasks, where the first one is ten times better; then a large motion.
+    usual, large = np.array([0.1, 1.0]), np.array([20.0, 2.0])
+    missed = np.vstack([np.tile(usual, (19, 1)), large])
+    few = simplex_weights(errors_from(np.zeros(20), missed, count=5.0), 1)
+    many = simplex_weights(errors_from(np.zeros(20), missed, count=1e6), 1)
+    assert few[0, 0, 0] > 0.95
+    assert many[0, 0, 1] > 0.95
+
+
+def test_weights_in_other_units_are_the_same():
+    random = np.random.default_rng(0)
+    truth = random.normal(0, 1, 40)
+    predictions = truth[:, None] + random.normal(0, [1, 2, 3], (40, 3))
+    first, again = (
+        simplex_weights(errors_from(unit * truth, unit * predictions, count=30.0), 1)
+        for unit in (1.0, 0.1)
+    )
+    assert again == pytest.approx(first, abs=1e-5)
+
+
 def test_a_task_counts_once_however_many_values_it_has():
     zeros = np.zeros(5, dtype=np.int64)
     errors = Errors(

@@ -1,9 +1,9 @@
 """Weights of several predictors on a simplex, and how far a model may correct their mean.
 
-Both are fitted in closed form to errors on tasks, per channel and kind of value (a *key*: its time
-since observation, and how much the channel moves). Values of one task are correlated, so a task
-counts once per key, and all of them together count at most as often as independent spans of that
-length fit into the data.
+Both are fitted to errors on tasks by least squares, per channel and kind of value (a *key*: its
+time since observation, and how much the channel moves). Values of one task are correlated, so a
+task counts once per key, and all of them together count at most as often as independent spans of
+that length fit into the data.
 """
 
 from __future__ import annotations
@@ -20,11 +20,26 @@ Integers = NDArray[np.int64]
 POOLED = 6.0
 """Tasks of all channels together that count beside those of a channel."""
 
-WORST = 4.0
+WORST = 16.0
 """Largest squared error in the pooled tasks, relative to that of the best predictor."""
 
-STILL = 1.0
-"""Tasks in which nothing moves that count beside the others."""
+MANY = 100.0
+"""Independent tasks with which the mean squared error decides, and no longer single tasks."""
+
+SELECTED = 2.0
+"""Independent tasks with which selection of one predictor counts as much as averaging."""
+
+MOST_SELECTED = 0.9
+"""Largest part of selection."""
+
+ROUNDS = 3
+"""Least-squares problems that are solved in turn."""
+
+EXACT = 1e-8
+"""Mean squared error, in the unit of errors, below which a task is predicted exactly."""
+
+RIDGE = 1e-8
+"""Added to a Gram matrix whose mean diagonal is 1."""
 
 CAUTION = 2.0
 """Tasks in which a model has nothing to say that count beside the others."""
@@ -148,11 +163,16 @@ def as_if_refitted(
 
 
 def simplex_weights(errors: Errors, channels: int) -> Array:
-    """Weights of predictors, at least 0 and of sum 1, with the least squared error.
+    """Weights of predictors, at least 0 and of sum 1, that have small errors on all tasks.
 
-    The Gram matrix of the errors of a key and channel gets `POOLED` tasks of all channels, and
-    `STILL` tasks whose truth is the last value (Wolpert, Stacked generalization, 1992; Breiman,
-    Stacked regressions, 1996).
+    The Gram matrix of the errors of a kind and channel gets `POOLED` tasks of similar kinds and of
+    all channels (stacking: Wolpert 1992, Breiman 1996). With s the mean squared error of a task,
+    what is minimised is the sum of log(1 + s / (f m)) over tasks, with m the mean of s, by
+    iteratively reweighted least squares. The factor f grows with the number of independent tasks:
+    with few of them, one large motion does not decide; with `MANY` of them and more, this is nearly
+    least squares. To the Gram matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of
+    the mean of the members' own errors: with few tasks, one member is selected rather than several
+    averaged (Q-aggregation: Dai, Rigollet and Zhang 2012, Annals of Statistics 40(3)).
 
     Args:
         errors: on tasks that the predictors were not fitted to.
@@ -166,66 +186,125 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     weight, effective = task_weights(errors, channels)
     weight = weight * _robust(missed)
     place = errors.key * channels + errors.channel
-    size = errors.keys * channels
-    gram = np.empty((size, predictors, predictors))
-    still = np.empty_like(gram)
-    for j in range(predictors):
-        for k in range(j + 1):
-            for target, of in ((gram, missed), (still, errors.predictions)):
-                product = np.bincount(place, weight * of[:, j] * of[:, k], minlength=size)
-                target[:, j, k] = target[:, k, j] = product
-    shape = (errors.keys, channels, predictors, predictors)
-    many = np.maximum(effective, 1e-12)[..., None, None]
-    mean = gram.reshape(shape) / many
-    moved = np.bincount(place, weight * errors.truth**2, minlength=size).reshape(shape[:2])
-    # In units of what the channel moves, so that they never outweigh what is well predicted.
-    mean_still = still.reshape(shape) / np.maximum(moved, 1e-12)[..., None, None]
-    # Channels are pooled relative to the error of their best predictor.
-    smallest = np.einsum("kcjj->kcj", mean).min(axis=2)
-    relative = 1.0 / np.maximum(smallest, 1e-12)[..., None, None]
-    seen = (effective > 0)[..., None, None]
-    own = np.where(seen, mean * relative, 0.0)
-    large = np.einsum("kcjj->kcj", own)
-    shrink = np.sqrt(np.minimum(1.0, WORST / np.maximum(large, 1e-12)))
-    shared = effective[..., None, None] * own * shrink[..., :, None] * shrink[..., None, :]
-    near = _pooled(shared, effective, errors.groups)
-    weights = np.empty((errors.keys, channels, predictors))
-    for key in range(errors.keys):
-        for c in range(channels):
-            rest = STILL * mean_still[key, c] if effective[key, c] else 0.0
-            prior = POOLED * near[key, c]
-            weights[key, c] = on_simplex(effective[key, c] * own[key, c] + prior + rest)
+    order = np.argsort(place, kind="stable")
+    cells = _Cells.of_values(
+        place[order], errors.task[order], weight[order], errors.keys * channels
+    )
+    missed, shape = missed[order], (errors.keys, channels)
+    saturation = (errors.count.min() / MANY) ** 2
+    # First as if each task had the best predictor.
+    squares = np.min([cells.squares(column) for column in missed.T], axis=0)
+    weights = np.empty((*shape, predictors))
+    for _ in range(ROUNDS):
+        gram = cells.gram(missed, squares, saturation).reshape(*shape, predictors, predictors)
+        mean = gram / np.maximum(effective, 1e-12)[..., None, None]
+        # Channels are pooled relative to the error of their best predictor.
+        smallest = np.einsum("kcjj->kcj", mean).min(axis=2)
+        own = mean / np.maximum(smallest, 1e-12)[..., None, None]
+        large = np.einsum("kcjj->kcj", own)
+        shrink = np.sqrt(np.minimum(1.0, WORST / np.maximum(large, 1e-12)))
+        shared = effective[..., None, None] * own * shrink[..., :, None] * shrink[..., None, :]
+        near = _pooled(shared, effective, errors.groups)
+        for key, channel in np.ndindex(*shape):
+            many = float(effective[key, channel])
+            total = many * own[key, channel] + POOLED * near[key, channel]
+            part = min(SELECTED / (SELECTED + many), MOST_SELECTED)
+            weights[key, channel] = on_simplex(total, part)
+        mixed = weights.reshape(-1, predictors)[cells.place]
+        squares = cells.squares((mixed * missed).sum(axis=1))
     return weights
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Values in the order of their kind and channel, and the tasks in each of those.
+
+    Attributes:
+        place: (values,) kind and channel as one number, sorted.
+        bounds: (places + 1,) first value of each.
+        weight: (values,) of each value.
+        task: (values,) number of the task within its place.
+        of: (tasks,) place of each task.
+        total: (tasks,) sum of the weights of each task.
+    """
+
+    place: Integers
+    bounds: Integers
+    weight: Array
+    task: Integers
+    of: Integers
+    total: Array
+
+    @classmethod
+    def of_values(cls, place: Integers, task: Integers, weight: Array, places: int) -> _Cells:
+        many = int(task.max(initial=0)) + 1
+        codes, number = np.unique(place * many + task, return_inverse=True)
+        bounds = np.searchsorted(place, np.arange(places + 1))
+        total = np.asarray(np.bincount(number, weight), dtype=np.float64)
+        return cls(place, bounds, weight, number, codes // many, total)
+
+    def squares(self, missed: Array) -> Array:
+        """(tasks,) mean squared error."""
+        total = np.bincount(self.task, self.weight * missed**2)
+        return np.asarray(total / np.maximum(self.total, 1e-300))
+
+    def gram(self, missed: Array, squares: Array, saturation: float) -> Array:
+        """(places, predictors, predictors) of errors, a task of large errors counting less.
+
+        Args:
+            missed: (values, predictors).
+            squares: (tasks,) mean squared error with the weights so far.
+            saturation: multiple of its mean at which the influence of a task levels off.
+        """
+        places, predictors = len(self.bounds) - 1, missed.shape[1]
+        total = np.bincount(self.of, self.total, minlength=places)
+        summed = np.bincount(self.of, self.total * squares, minlength=places)
+        mean = (summed / np.maximum(total, 1e-300))[self.of]
+        least = saturation * mean + EXACT
+        factor = (mean + least) / (squares + least)
+        weight = self.weight * factor[self.task]
+        gram = np.zeros((places, predictors, predictors))
+        for i in np.flatnonzero(np.diff(self.bounds)):
+            values = missed[self.bounds[i] : self.bounds[i + 1]]
+            gram[i] = (values * weight[self.bounds[i] : self.bounds[i + 1], None]).T @ values
+        return gram
 
 
 def _pooled(shared: Array, effective: Array, groups: Integers) -> Array:
     """Mean Gram matrices of what is like a key and channel: the same shape as `shared`.
 
-    The channel in all kinds of the group, and all channels in this kind, half each; where there is
-    neither, all channels of the group; where that is empty, the group before.
+    All channels in this kind, and the channel in the kinds at the same place of the groups before
+    and after, half each. Where there is no value of either, all channels of all these kinds; where
+    there is none of those, all channels of the group, or of all groups.
     """
+    keys, channels = effective.shape
     mean = np.zeros_like(shared)
-    before = np.zeros(shared.shape[2:])
-    for group in range(int(groups.max(initial=0)) + 1):
-        keys = np.flatnonzero(groups == group)
-        total = effective[keys].sum()
-        every = shared[keys].sum(axis=(0, 1)) / total if total else before
-        before = every
-        for key in keys:
-            here = effective[key].sum()
-            kind = shared[key].sum(axis=0) / here if here else every
-            for c in range(shared.shape[1]):
-                own = effective[keys, c].sum()
-                channel = shared[keys, c].sum(axis=0) / own if own else every
-                mean[key, c] = (kind + channel) / 2
+    # Place of a kind in its group: it is compared with the kinds at the same place of others.
+    place = np.array([int((groups[:k] == groups[k]).sum()) for k in range(keys)])
+
+    def averaged(kinds: Integers, before: Array) -> Array:
+        many = effective[kinds].sum()
+        return np.asarray(shared[kinds].sum(axis=(0, 1)) / many if many else before)
+
+    anything = averaged(np.arange(keys), np.zeros(shared.shape[2:]))
+    for key in range(keys):
+        same = np.flatnonzero((place == place[key]) & (np.abs(groups - groups[key]) <= 1))
+        group = averaged(np.flatnonzero(groups == groups[key]), anything)
+        kind = averaged(np.array([key]), averaged(same, group))
+        others = same[same != key] if len(same) > 1 else same
+        for channel in range(channels):
+            many = effective[others, channel].sum()
+            own = shared[others, channel].sum(axis=0) / many if many else kind
+            mean[key, channel] = (kind + own) / 2
     return mean
 
 
-def on_simplex(gram: Array) -> Array:
-    """The weights w, at least 0 and of sum 1, with the least w' G w.
+def on_simplex(gram: Array, selected: float = 0.0) -> Array:
+    """The weights w, at least 0 and of sum 1, with the least (1 - s) w' G w + s sum_j w_j G_jj.
 
     Args:
-        gram: (predictors, predictors) positive semi-definite.
+        gram: (predictors, predictors) G, positive semi-definite.
+        selected: s, from 0 to below 1.
 
     Returns:
         (predictors,).
@@ -234,11 +313,15 @@ def on_simplex(gram: Array) -> Array:
     largest = float(np.trace(gram)) / size
     if not largest > 0:
         return np.full(size, 1.0 / size)
-    values, vectors = np.linalg.eigh(gram / largest + 1e-9 * np.eye(size))
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    gram = gram / largest
+    values, vectors = np.linalg.eigh(gram + RIDGE * np.eye(size))
+    root = np.sqrt(np.maximum(values, RIDGE))
+    # |A w + b|^2 with A' A = G and 2 A' b = s / (1 - s) diag(G)
+    linear = vectors.T @ np.diag(gram) * (selected / (1 - selected)) / (2 * root)
     # A row of large weight asks for the sum.
-    system = np.vstack([root, np.full(size, 1e3)])
-    found, _ = nnls(system, np.append(np.zeros(size), 1e3), maxiter=50 * size)
+    strict = 1e3 * max(1.0, float(np.abs(linear).max()))
+    system = np.vstack([root[:, None] * vectors.T, np.full(size, strict)])
+    found, _ = nnls(system, np.append(-linear, strict), maxiter=50 * size)
     return np.asarray(found / found.sum())
 
 
