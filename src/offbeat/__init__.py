@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from offbeat.answers.forecast import forecast
     from offbeat.answers.impute import impute
     from offbeat.answers.predict import predict
+    from offbeat.answers.resample import resample
     from offbeat.answers.saved import load_run
     from offbeat.comparison import Comparison, compare
     from offbeat.data.batch import Batch
@@ -95,6 +96,7 @@ _PUBLIC = {
     "register_reader": "data.readers",
     "register_robot": "data.robots",
     "register_writer": "data.writers",
+    "resample": "answers.resample",
     "save": "data.writers",
     "simulate": "data.simulate",
     "split": "data.splits",
@@ -195,6 +197,7 @@ __all__ = [
     "register_reader",
     "register_robot",
     "register_writer",
+    "resample",
     "save",
     "simulate",
     "split",

@@ -21,6 +21,7 @@ from offbeat.cli.forecast import forecast_command
 from offbeat.cli.impute import impute_command
 from offbeat.cli.inspect import inspect_command
 from offbeat.cli.predict import predict_command
+from offbeat.cli.resample import resample_command
 from offbeat.cli.simulate import simulate_command
 from offbeat.cli.stream import stream_command
 from offbeat.cli.sweep import sweep_command
@@ -56,6 +57,7 @@ COMMANDS: dict[str, Any] = {
     "export": export_command,
     "impute": impute_command,
     "forecast": forecast_command,
+    "resample": resample_command,
     "demo": demo_command,
     "doctor": doctor_command,
 }

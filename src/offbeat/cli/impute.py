@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.cli.common import (
-    answer_columns,
     check_figure,
-    check_out,
     known_options,
     one_trajectory,
     plotted_channels,
     read_log,
     say,
 )
+from offbeat.cli.written import check_answers, write_answers
 from offbeat.config import check_seed
 
 
@@ -25,6 +24,7 @@ def impute_command(
     out: Path,
     mode: str | None = None,
     rate_hz: float | None = None,
+    format: str | None = None,
     figure: Path | None = None,
     channels: list[str] | None = None,
     trajectory: int = 0,
@@ -40,12 +40,14 @@ def impute_command(
         out: .csv or .parquet file with columns trajectory, time (s), one per channel, and one
             `name|observed` per channel: true where the value was measured, false where it was
             filled. With a blend also `name|low` and `name|high`, the ends of the interval of 90 %,
-            and `name|beyond`, true where an answer is beyond what was trained.
+            and `name|beyond`, true where an answer is beyond what was trained. Other formats by
+            their suffix: .mcap, .hdf5 (robomimic), .npz; a name without one is a LeRobot data set.
         mode: causal, from the past alone; two_sided, from past and future, the default of a run
             with a blend, which offbeat train makes.
         rate_hz: add rows at this rate where no row is within half a period, so that times at which
             no sensor reported are filled too. The log is then not split at outages, unless
             --reader.max_gap_s is given.
+        format: to write, such as minari; by default found by the name of out.
         figure: .png, .pdf or .svg of one trajectory, its fills, linear interpolation and PCHIP.
         channels: to plot; by default the first four.
         trajectory: to plot, counted from 0.
@@ -57,10 +59,9 @@ def impute_command(
     from offbeat.answers.impute import impute
     from offbeat.answers.saved import load_run
     from offbeat.cli.scored import fill_figure
-    from offbeat.data.writers.tables import write_table
     from offbeat.models.base import BaseModel
 
-    check_out(out, data)
+    check_answers(out, data, format)
     check_figure(figure)
     check_seed(seed)
     loaded = load_run(model)
@@ -76,12 +77,20 @@ def impute_command(
     filled = impute(loaded, dataset, mode=mode, rate_hz=rate_hz, seed=seed)  # type: ignore[arg-type]
     chosen = plotted_channels(filled.names, channels)
     one_trajectory(dataset, trajectory)
-    write_table(out, answer_columns(dataset, filled))
+    name = write_answers(out, dataset, filled, format=format, data=data)
     filled_values = sum(int((~t.observed).sum()) for t in filled)
     total = sum(t.observed.size for t in filled)
     how = str(filled.meta["filled"])
-    result = {"written": str(out), "mode": how, "filled": filled_values, "values": total}
+    result = {
+        "written": str(out),
+        "format": name,
+        "mode": how,
+        "filled": filled_values,
+        "values": total,
+    }
     text = f"{out}: {filled_values} of {total} values filled ({how})"
+    if not filled_values:
+        text += _why_none(dataset, rate_hz)
     if figure is not None:
         fill_figure(
             loaded, dataset, figure, chosen, trajectory, mode=how, rate_hz=rate_hz, seed=seed
@@ -89,3 +98,17 @@ def impute_command(
         result["figure"] = str(figure)
         text += f"; {figure}"
     say(result, text, json)
+
+
+def _why_none(dataset: Any, rate_hz: float | None) -> str:
+    """Why there was nothing to fill, and what gives something, in a sentence."""
+    import numpy as np
+
+    gaps = np.concatenate([np.diff(t.times) for t in dataset] or [np.zeros(0)])
+    if rate_hz is not None or not len(gaps):
+        return "; every channel was measured in every row, so there is nothing to fill"
+    rate = 1 / float(np.median(gaps))
+    return (
+        "; every channel was measured in every row, so there is nothing to fill: --rate_hz "
+        f"{2 * rate:.3g} adds rows in between, and offbeat evaluate masks values and scores fills"
+    )

@@ -30,6 +30,29 @@ def add_rows(trajectory: Trajectory, times: NDArray[np.float64]) -> Trajectory:
     return replace(trajectory, times=union, values=values, observed=observed)
 
 
+def even_times(trajectory: Trajectory, rate_hz: float) -> NDArray[np.float64]:
+    """(times,) s, the first time and the multiples of a period after it, up to the last time.
+
+    Args:
+        trajectory: of any number of rows.
+        rate_hz: one over the period, above 0.
+
+    Raises:
+        InputError: as of `times_at_rate`.
+    """
+    number = isinstance(rate_hz, int | float) and not isinstance(rate_hz, bool)
+    if not (number and 0 < rate_hz < np.inf):
+        raise InputError(f"rate_hz must be a positive number of rows per second, got {rate_hz!r}")
+    times = trajectory.times
+    lasts = float(times[-1] - times[0])
+    if lasts * rate_hz > _MOST_ROWS:
+        raise InputError(
+            f"rate_hz {rate_hz:g} over {lasts:.6g} s gives {lasts * rate_hz:.3g} rows, more than "
+            f"{_MOST_ROWS}; use a lower rate, or a shorter log"
+        )
+    return np.asarray(times[0] + np.arange(int(lasts * rate_hz * (1 + 1e-12)) + 1) / rate_hz)
+
+
 def times_at_rate(trajectory: Trajectory, rate_hz: float) -> NDArray[np.float64]:
     """(times,) s, multiples of a period after the first row that no row is within half a period of.
 
@@ -42,17 +65,7 @@ def times_at_rate(trajectory: Trajectory, rate_hz: float) -> NDArray[np.float64]
     Raises:
         InputError: the rate is not above 0 and finite, or gives more than 20 million rows.
     """
-    number = isinstance(rate_hz, int | float) and not isinstance(rate_hz, bool)
-    if not (number and 0 < rate_hz < np.inf):
-        raise InputError(f"rate_hz must be a positive number of rows per second, got {rate_hz!r}")
-    times = trajectory.times
-    lasts = float(times[-1] - times[0])
-    if lasts * rate_hz > _MOST_ROWS:
-        raise InputError(
-            f"rate_hz {rate_hz:g} over {lasts:.6g} s gives {lasts * rate_hz:.3g} rows, more than "
-            f"{_MOST_ROWS}; use a lower rate, or a shorter log"
-        )
-    grid = times[0] + np.arange(int(lasts * rate_hz * (1 + 1e-12)) + 1) / rate_hz
+    times, grid = trajectory.times, even_times(trajectory, rate_hz)
     after = np.clip(np.searchsorted(times, grid), 1, max(len(times) - 1, 1))
     nearest = np.minimum(
         np.abs(grid - times[after - 1]), np.abs(times[np.minimum(after, len(times) - 1)] - grid)
