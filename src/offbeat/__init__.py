@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig
+from offbeat.config import ModelConfig, RedrawConfig, SplitConfig, TaskConfig, TrainConfig
 from offbeat.errors import (
     DivergenceError,
     FileFormatError,
@@ -65,7 +65,6 @@ _PUBLIC = {
     "Model": "models.model",
     "OnnxStream": "export.runner",
     "Prediction": "parts",
-    "RedrawConfig": "config",
     "Scaler": "data.scaler",
     "Scores": "metrics",
     "Stream": "stream.stream",
