@@ -77,7 +77,7 @@ def draw(
         plt.Line2D([], [], color=AFTER, lw=1.8, label="once the sensor is back"),
     ]
     figure.legend(handles=legend, loc="lower center", ncols=4, fontsize=8, frameon=False)
-    figure.tight_layout(rect=(0, 0.07, 1, 1), h_pad=0.6)
+    figure.tight_layout(rect=(0, 0.09, 1, 1), h_pad=0.6)
     frames = []
     for now in times:
         for axes, name in zip(np.atleast_1d(panels), shown, strict=True):
@@ -102,6 +102,7 @@ def draw(
             axes.set_title(name + unit, fontsize=9, loc="left", pad=3)
             axes.spines[["top", "right"]].set_visible(False)
             axes.tick_params(labelsize=8)
+        np.atleast_1d(panels)[-1].set_xlabel("s", fontsize=8)
         data = io.BytesIO()
         figure.savefig(data, format="png")
         frames.append(Image.open(data).convert("RGB"))
@@ -151,7 +152,8 @@ def main() -> None:
     frames = draw(whole, live, after, shown, span)
     frames[-1].save(Path(given.out).with_suffix(".png"))
     pause = [60] * (len(frames) - 1) + [2500]
-    small = [frame.quantize(48, dither=Image.Dither.NONE) for frame in frames]
+    palette = frames[-1].quantize(64)  # one for all frames: it has every colour
+    small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     small[0].save(given.out, save_all=True, append_images=small[1:], duration=pause, loop=0)
 
 

@@ -32,37 +32,53 @@ def document(text: str, name: str, body: str) -> str:
     return f"{before}{start}\n\n{body.strip()}\n\n{end}{after}"
 
 
-BY_HAND = {
-    "forecast 0.1 s": ("last_value", "constant_velocity"),
-    "forecast 0.5 s": ("last_value", "constant_velocity"),
-    "fill 0.5 s": ("linear", "pchip"),
+FRONT_PAGE = {
+    "forecast 0.5 s": (
+        ("last_value",),
+        ("constant_velocity",),
+        ("kalman_short", "kalman_long", "motion_filter"),
+        ("ridge",),
+        ("offbeat",),
+    ),
+    "fill 0.5 s": (
+        ("last_value",),
+        ("pchip",),
+        ("smoother", "motion_smoother"),
+        ("ridge_fill",),
+        ("offbeat_two_sided",),
+    ),
 }
-"""Tasks of the front page, and what an engineer would do by hand; the better one is shown."""
+"""Tasks of the front page, and what is used for them; the best of several is shown."""
 
 
 def front_page(summaries: Sequence[Summary]) -> str:
-    """A row per test part: what is done by hand, and Offbeat, RMSE in scaled units.
+    """A row per task and test part: what people use, and Offbeat, RMSE in scaled units.
 
     Args:
         summaries: of the logs that have results of Offbeat.
     """
-    head = ["log"]
-    for task in BY_HAND:
-        head += [f"{task}: by hand", "Offbeat"]
+    head = ["", "last value", "constant velocity, or PCHIP", "Kalman", "ridge", "Offbeat"]
     rows = []
-    for summary in summaries:
-        for test in summary.tests:
-            title = summary.head["title"].split(":")[0]
-            row = [title + (f", {test}" if len(summary.tests) > 1 else "")]
-            for task, simple in BY_HAND.items():
-                own = "offbeat_two_sided" if task.startswith("fill") else "offbeat"
-                errors = {n: _mean(summary.scaled(test, task, n)) for n in simple}
-                best = min(errors, key=lambda name: errors[name])
-                ours = _mean(summary.scaled(test, task, own))
-                bold = "**" if ours < errors[best] else ""
-                name = _label(summary, best).removesuffix(" (both sides)")
-                row += [f"{errors[best]:.3g} ({name})", f"{bold}{ours:.3g}{bold}"]
-            rows.append(row)
+    for task, columns in FRONT_PAGE.items():
+        for summary in summaries:
+            for test in summary.tests:
+                title = summary.head["title"].split(":")[0]
+                title += f", {test}" if len(summary.tests) > 1 else ""
+                errors = [
+                    min(
+                        (
+                            _mean(summary.scaled(test, task, name))
+                            for name in names
+                            if name in summary.predictors and summary.scaled(test, task, name)
+                        ),
+                        default=np.nan,
+                    )
+                    for names in columns
+                ]
+                best = np.nanmin(errors)
+                shown = ["" if np.isnan(e) else f"{e:.3g}" for e in errors]
+                bold = [f"**{t}**" if e == best else t for t, e in zip(shown, errors, strict=True)]
+                rows.append([f"{task}: {title}", *bold])
     return _table(head, rows)
 
 
