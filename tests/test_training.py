@@ -461,6 +461,28 @@ def test_a_run_whose_checkpoint_does_not_say_on_which_data_is_not_resumed(tmp_pa
         ob.fit(ob.make_model("gru", TRAIN, **SMALL), TRAIN, out=tmp_path, progress=False)
 
 
+def test_a_run_goes_on_after_a_version_that_added_options(tmp_path):
+    """What the checkpoint does not name, it did as the default of the option does today."""
+    config = ob.TrainConfig(epochs=1)
+    ob.fit(ob.make_model("gru", TRAIN, **SMALL), TRAIN, config=config, out=tmp_path, progress=False)
+    (checkpoint,) = (tmp_path / "checkpoints").iterdir()
+    model = ob.load_model(tmp_path)
+    _, tensors, record = load_training_state(checkpoint)
+    for part, names in {"model": ("trend", "bounded"), "training": ("redraw", "loss")}.items():
+        for name in names:
+            del record["identity"][part][name]
+    save_training_state(model, tensors, record, checkpoint)
+    more = ob.TrainConfig(epochs=2)
+    made = ob.make_model("gru", TRAIN, **SMALL)
+    result = ob.fit(made, TRAIN, config=more, out=tmp_path, progress=False)
+    assert len(result.history) == 2
+
+    other = ob.make_model("gru", TRAIN, **SMALL)
+    relative = ob.TrainConfig(epochs=3, loss="relative")
+    with pytest.raises(ob.InputError, match="loss 'head' then, 'relative' now"):
+        ob.fit(other, TRAIN, config=relative, out=tmp_path, progress=False)
+
+
 # --- recipes, devices, callbacks ------------------------------------------------------------------
 
 

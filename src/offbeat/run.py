@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from offbeat.models.checkpoint import load_training_state, save_training_state
 from offbeat.models.corrected import CorrectedModel
 from offbeat.models.foreign import ForeignModel
 from offbeat.models.model import Model
+from offbeat.models.zoo import COMMON
 
 
 @dataclass(frozen=True)
@@ -215,13 +216,6 @@ def identity_of(
     }
     if recipe.schedule == "constant":
         identity["training"].pop("epochs")  # such a run can be trained for longer
-    if recipe.tasks is None:  # as in runs of versions that had no tasks
-        for name in ("tasks", "tasks_per_epoch"):
-            identity["training"].pop(name)
-    if recipe.redraw is None:
-        identity["training"].pop("redraw")
-    if recipe.loss == "head":
-        identity["training"].pop("loss")
     if baselines is not None:
         identity["baselines"] = [_predictor(each) for each in baselines]
     # lists in place of tuples, as in the file
@@ -328,7 +322,8 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
             "model can be used, but the run can't be resumed: give another folder"
         )
     for part in _WORDS:
-        then, now = kept["identity"].get(part), identity.get(part)
+        now = identity.get(part)
+        then = _completed(kept["identity"].get(part), now)
         if then != now:
             raise InputError(
                 f"{folder} holds another run: {_WORDS[part]} differ{_difference(then, now)}; give "
@@ -357,12 +352,29 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
     write_log(folder, state.history)
 
 
+_DEFAULTS: dict[str, Any] = {
+    **COMMON,
+    **{f.name: f.default for f in fields(Recipe) if f.default is not MISSING},
+}
+"""What an option stands for that a run does not name, because it is younger than the run."""
+
+
+def _completed(then: Any, now: Any) -> Any:
+    """An identity with the options that later versions added."""
+    if not isinstance(then, dict) or not isinstance(now, dict):
+        return then
+    added = {key: _DEFAULTS[key] for key in now if key not in then and key in _DEFAULTS}
+    return {**added, **{key: _completed(value, now.get(key)) for key, value in then.items()}}
+
+
 def _difference(then: Any, now: Any) -> str:
     """A short description of the difference."""
     if not isinstance(then, dict) or not isinstance(now, dict):
         one_is_missing = then is None or now is None
         return f" ({'none' if then is None else 'one'} then)" if one_is_missing else ""
     keys = [key for key in now if then.get(key) != now[key]]
+    if len(keys) == 1 and isinstance(then.get(keys[0]), dict) and isinstance(now[keys[0]], dict):
+        return _difference(then[keys[0]], now[keys[0]])
     if "name" in keys:  # for another model, all else differs as well
         keys = ["name"]
     short = [key for key in keys if key != "fingerprint" and not isinstance(now[key], list)]

@@ -27,7 +27,7 @@ from offbeat.models.model import Model, depends_on_rows
 from offbeat.models.statistics import Statistics
 from offbeat.registry import Registry
 
-_COMMON: dict[str, Any] = {
+COMMON: dict[str, Any] = {
     "hidden_size": 15,
     "head": "point",
     "decoder_units": (100,),
@@ -209,7 +209,7 @@ def resolve(config: ModelConfig) -> ModelConfig:
     Raises:
         InputError: the zoo has no such entry.
     """
-    chosen = {**_COMMON, **MODELS[config.name].options}
+    chosen = {**COMMON, **MODELS[config.name].options}
     still_open = {
         f.name: chosen[f.name]
         for f in fields(config)
