@@ -1,0 +1,1 @@
+"""The thesis' Hopper, and how far its prediction can be taken."""
