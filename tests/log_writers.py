@@ -126,4 +126,5 @@ else:
     WRITERS |= robot_logs.SAME_WALK
     WRITERS["hdf5 robomimic written"] = written("robomimic", ".hdf5")
     WRITERS["hdf5 minari written"] = written("minari", "")
+    WRITERS["ros mcap written"] = written("mcap", ".mcap")
     OPTIONS |= robot_logs.SAME_WALK_OPTIONS

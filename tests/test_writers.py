@@ -91,7 +91,7 @@ def test_every_format_keeps_times_values_names_and_units(tmp_path, name):
         assert np.array_equal(a.values, values, equal_nan=True)
 
 
-NEEDS = {"robomimic": "h5py", "minari": "h5py"}
+NEEDS = {"robomimic": "h5py", "minari": "h5py", "mcap": "mcap"}
 
 
 def walk(rows=(20, 12)) -> ob.Dataset:
@@ -232,6 +232,134 @@ class TestHdf5:
         assert (again.names, again.units) == (walk().names, walk().units)
         assert again.roles == walk().roles
         assert stamps(again) == stamps(walk())
+
+
+class TestMcap:
+    @pytest.fixture(autouse=True)
+    def mcap(self):
+        return pytest.importorskip("mcap.reader")
+
+    def test_rows_are_json_with_stamps_masks_and_a_schema(self, mcap, tmp_path):
+        save(walk(), tmp_path / "walk.mcap")
+        with (tmp_path / "walk.mcap").open("rb") as file:
+            reader = mcap.make_reader(file)
+            summary = reader.get_summary()
+            assert summary.statistics.message_count == 32
+            (schema,) = summary.schemas.values()
+            assert (schema.name, schema.encoding) == ("offbeat.Row", "jsonschema")
+            assert json.loads(schema.data)["x-units"] == list(walk().units)
+            found = list(reader.iter_messages(topics=["/offbeat/1"]))
+        assert [message.log_time for _, _, message in found] == stamps(walk())[1]
+        said = json.loads(found[3][2].data)
+        time = said["timestamp"]
+        assert time["sec"] * 10**9 + time["nsec"] == found[3][2].log_time
+        assert said["values"] == dict(zip(walk().names, walk()[1].values[3].tolist(), strict=True))
+        assert list(said["observed"].values()) == walk()[1].observed[3].tolist()
+
+    def test_it_is_read_back_with_names_units_roles_and_clock(self, tmp_path):
+        save(walk(), tmp_path / "walk.mcap")
+        again = ob.read(tmp_path / "walk.mcap")
+        assert (again.names, again.units) == (walk().names, walk().units)
+        assert again.roles == walk().roles
+        assert stamps(again) == stamps(walk())
+        assert again.meta["labels"] == ["0", "1"]
+        assert again[1].values.tobytes() == walk()[1].values.tobytes()
+
+    @pytest.mark.parametrize("kind", ["db3", "mcap", "bag"])
+    def test_the_messages_of_a_bag_are_repeated_at_other_times(self, mcap, tmp_path, kind):
+        logs = pytest.importorskip("robot_logs")
+        store = logs.ROS1 if kind == "bag" else logs.ROS2
+        start = 1_700_000_000 * 10**9
+        messages = []
+        for i in range(40):
+            at = start + i * 10**7
+            joints = logs.joint_message(store, at, ["hip", "knee"], [i / 8, -i / 4])
+            pose = logs.pose_message(store, at + 3000, [i, 2, 3, 0, 0, 0, 1], f"frame{i % 3}")
+            messages += [("/joints", at, joints), ("/pose", at + 5000, pose)]
+        log = tmp_path / ("walk.bag" if kind == "bag" else "walk")
+        if kind == "bag":
+            logs.write_bag1(log, messages)
+        else:
+            logs.write_bag2(log, messages, mcap=kind == "mcap")
+        data = ob.read(log, topics=["/joints"])
+        at = np.array([0.0, 0.005, 0.0175, 0.2])
+        asked = ob.Trajectory(at, np.column_stack([at, 2 * at]), names=data.names)
+        out = tmp_path / "out.mcap"
+        clock = {"clock_start": [start], "time_unit": "ns"}
+        save(ob.Dataset((asked,), clock), out, log=log)
+        with out.open("rb") as file:
+            reader = mcap.make_reader(file)
+            summary = reader.get_summary()
+            topics = {c.topic: c.message_encoding for c in summary.channels.values()}
+            encoding = "ros1" if kind == "bag" else "cdr"
+            assert topics == {"/joints": encoding, "/offbeat": encoding}
+            found = list(reader.iter_messages(topics=["/joints"]))
+        for (schema, _, message), t in zip(found, at, strict=True):
+            assert message.log_time == start + round(t * 1e9)
+            if kind == "bag":
+                assert schema.name == "sensor_msgs/JointState"
+                assert schema.encoding == "ros1msg"
+                got = store.deserialize_ros1(message.data, "sensor_msgs/msg/JointState")
+            else:
+                assert (schema.name, schema.encoding) == ("sensor_msgs/msg/JointState", "ros2msg")
+                got = store.deserialize_cdr(message.data, "sensor_msgs/msg/JointState")
+            assert got.name == ["hip", "knee"]
+            assert got.position.tolist() == [t, 2 * t]
+            assert got.header.stamp.sec * 10**9 + got.header.stamp.nanosec == message.log_time
+        again = ob.read(out)
+        assert again[0].values.tolist() == asked.values.tolist()
+        assert again.names == data.names
+        if kind != "bag":
+            rosbags = pytest.importorskip("rosbags.rosbag2")
+            with rosbags.Reader(out) as bag:
+                found = list(bag.messages())
+                (kind,) = [c for c in bag.connections if c.topic == "/offbeat"]
+            times = [t for c, t, _ in found if c.topic == "/joints"]
+            assert times == [start + round(t * 1e9) for t in at]
+            typesys = pytest.importorskip("rosbags.typesys")
+            types = typesys.get_typestore(typesys.Stores.EMPTY)
+            types.register(typesys.get_types_from_msg(kind.msgdef.data, kind.msgtype))
+            last = types.deserialize_cdr(found[-1][2], kind.msgtype)
+            assert last.names == list(data.names)
+            assert last.values.tolist() == asked.values[-1].tolist()
+            assert last.observed.tolist() == [True, True]
+            assert len(last.low) == 0
+
+    def test_texts_and_frames_are_those_of_the_message_before(self, tmp_path):
+        logs = pytest.importorskip("robot_logs")
+        messages = [
+            ("/pose", 10**18 + i * 10**7, logs.pose_message(
+                logs.ROS2, 10**18 + i * 10**7, [i, 0, 0, 0, 0, 0, 1], "base"))
+            for i in range(30)
+        ]  # fmt: skip
+        log = logs.write_bag2(tmp_path / "walk", messages)
+        data = ob.read(log)
+        from offbeat.data.writers.ros_messages import messages_like
+
+        (topic,) = messages_like(log, data, [10**18 + np.arange(30) * 10**7 + 1])
+        got = logs.ROS2.deserialize_cdr(topic.messages[7][1], "geometry_msgs/msg/PoseStamped")
+        assert got.header.frame_id == "base"
+        assert got.pose.position.x == 7
+        assert got.header.stamp.nanosec == 7 * 10**7 + 1
+
+    def test_a_time_before_0_and_a_damaged_row_are_refused(self, tmp_path, mcap):
+        early = ob.Dataset((ob.Trajectory([-1.0, 0.0], [[1.0], [2.0]]),))
+        with pytest.raises(ob.InputError, match="no times before 0"):
+            save(early, tmp_path / "walk.mcap")
+        from mcap.writer import Writer
+
+        with (tmp_path / "bad.mcap").open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            described = {"x-names": ["x"], "x-units": [""], "x-roles": ["state"]}
+            schema = writer.register_schema(
+                "offbeat.Row", "jsonschema", json.dumps(described).encode()
+            )
+            channel = writer.register_channel("/offbeat", "json", schema)
+            writer.add_message(channel, 0, b'{"values": {}}', 0)
+            writer.finish()
+        with pytest.raises(ob.FileFormatError, match="a row of topic /offbeat is damaged"):
+            ob.read(tmp_path / "bad.mcap")
 
 
 def test_npz_holds_masks_and_is_read_back_without_them(tmp_path):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from offbeat.data.readers import mcap_rows
 from offbeat.data.readers.options import Fields, names
 from offbeat.data.readers.ros_files import Bag, Connection, explained, open_bag
 from offbeat.data.readers.ros_topic import Topic
@@ -31,6 +32,7 @@ _NOT_BY_DEFAULT = (
     "nav_msgs/msg/GridCells",
     "nav_msgs/msg/OccupancyGrid",
     "nav_msgs/msg/Path",
+    "offbeat_msgs/",
     "rcl_interfaces/",
     "rosgraph_msgs/",
     "sensor_msgs/msg/CameraInfo",
@@ -94,6 +96,9 @@ def recordings(
     if not path.is_dir():
         require_file(path)
     with open_bag(path) as bag:
+        if bag.connections and all(c.kind == mcap_rows.KIND for c in bag.connections):
+            yield from mcap_rows.recordings(bag, path)
+            return
         notes: list[str] = [*bag.notes]
         chosen = _chosen(bag.connections, topics, path, notes)
         wanted = Fields(fields, sorted({c.topic for c in chosen}))

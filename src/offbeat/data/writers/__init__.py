@@ -14,7 +14,7 @@ from typing import Any
 
 from offbeat.data import store
 from offbeat.data.trajectory import Dataset
-from offbeat.data.writers import lerobot, minari, npz, robomimic, tables
+from offbeat.data.writers import lerobot, mcap, minari, npz, robomimic, tables
 from offbeat.errors import InputError, one_of
 from offbeat.registry import Registry
 
@@ -110,6 +110,7 @@ def save(dataset: Dataset, path: str | Path, *, format: str | None = None, **opt
     | `csv`, `table` | `.csv`, `.pq` | |
     | `npz` | `.npz` | `level` |
     | `robomimic` | `.hdf5`, `.h5` | `rate_hz`, `level` |
+    | `mcap` | `.mcap` | `log`, `level` |
     | `lerobot` | a folder | `rate_hz`, `task`, `level` |
     | `minari` | a folder, by name | `level` |
 
@@ -122,7 +123,8 @@ def save(dataset: Dataset, path: str | Path, *, format: str | None = None, **opt
         path: the file or folder; what is there in this format is replaced.
         format: name of the format; by default found by the suffix.
         **options: of the format: `rate_hz`, rows per second; `level`, probability of the intervals
-            of answers; `task`, what the robot does.
+            of answers; `task`, what the robot does; `log`, the bag
+            whose messages are repeated.
 
     Raises:
         InputError: the format, suffix or an option is unknown, or the data set does not fit the
@@ -147,5 +149,6 @@ register_writer("csv", tables.write_dataset, suffixes=(".csv",))
 register_writer("table", tables.write_dataset, suffixes=(".pq",))
 register_writer("npz", npz.write_npz, suffixes=(".npz",))
 register_writer("robomimic", robomimic.write_robomimic, suffixes=(".hdf5", ".h5"))
+register_writer("mcap", mcap.write_mcap, suffixes=(".mcap",))
 register_writer("lerobot", lerobot.write_lerobot, suffixes=(FOLDER,))
 register_writer("minari", minari.write_minari, suffixes=(FOLDER,))
