@@ -20,6 +20,7 @@ from offbeat.cli.export import export_command
 from offbeat.cli.forecast import forecast_command
 from offbeat.cli.impute import impute_command
 from offbeat.cli.inspect import inspect_command
+from offbeat.cli.models import models_command
 from offbeat.cli.predict import predict_command
 from offbeat.cli.resample import resample_command
 from offbeat.cli.simulate import simulate_command
@@ -59,6 +60,7 @@ COMMANDS: dict[str, Any] = {
     "forecast": forecast_command,
     "resample": resample_command,
     "demo": demo_command,
+    "models": models_command,
     "doctor": doctor_command,
 }
 

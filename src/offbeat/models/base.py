@@ -176,6 +176,28 @@ class BaseModel(nn.Module):
 
         save_model(self, path)
 
+    def save_pretrained(self, path: str | Path, *, card: str | None = None) -> None:
+        """Writes the model and a card, `README.md`; see `offbeat.models.hub.save_pretrained`."""
+        from offbeat.models.hub import save_pretrained
+
+        save_pretrained(self, path, card=card)
+
+    @staticmethod
+    def from_pretrained(name: str | Path, *, revision: str | None = None) -> Any:
+        """Reads a model from a folder, the package or the Hugging Face Hub.
+
+        See `offbeat.models.hub.from_pretrained`.
+        """
+        from offbeat.models.hub import from_pretrained
+
+        return from_pretrained(name, revision=revision)
+
+    def push_to_hub(self, repository: str, **options: Any) -> str:
+        """Uploads the model and a card; see `offbeat.models.hub.push_to_hub`."""
+        from offbeat.models.hub import push_to_hub
+
+        return push_to_hub(self, repository, **options)
+
 
 def of_channels(dataset: Dataset, names: tuple[str, ...], units: tuple[str, ...]) -> Dataset:
     """A data set with the channels that a model was made for, in their order.

@@ -50,7 +50,8 @@ def load_model(path: str | Path) -> Any:
 
     Args:
         path: the folder of a checkpoint, of an unfinished training, or of a run
-            that `fit` wrote.
+            that `fit` wrote; or the name of a model that comes with the package, such as
+            `offbeat/hopper-30-ode_gru_d` (`offbeat models` lists them).
 
     Returns:
         A `Model`, a `CorrectedModel`, or a `ForeignModel`.
@@ -60,6 +61,10 @@ def load_model(path: str | Path) -> Any:
             its weights are not finite.
         InputError: it is a model of another package, which has not been registered.
     """
+    if str(path).startswith("offbeat/") and not Path(path).exists():
+        from offbeat.models.hub import trained_folder  # which builds on this module
+
+        path = trained_folder(str(path))
     path = Path(path)
     if not (path / CONFIG).is_file() and (path / "model" / CONFIG).is_file():
         path = path / "model"
@@ -188,6 +193,7 @@ _RENAMED = {"age_input": "time_input", "age_unit": "time_input_unit"}
 def _of_version_1(record: dict[str, Any]) -> dict[str, Any]:
     """Converts a record of version 1 to version 2."""
     config = {_RENAMED.get(key, key): value for key, value in record["model"].items()}
+    config.setdefault("time_input_unit", "gap")  # the first files of version 1 do not say
     return {
         **record,
         "name": config["name"],
