@@ -2,10 +2,13 @@
 
 import csv
 import importlib.metadata
+import io
 import json
+import re
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +21,8 @@ import yaml
 from packaging.requirements import Requirement
 
 import offbeat as ob
-from offbeat import doctor
-from offbeat.cli.app import COMMANDS, main, run_commands
+from offbeat import doctor, progress
+from offbeat.cli.app import COMMANDS, FREQUENT, main, run_commands
 from offbeat.cli.option_groups import reader_options, training_options
 from offbeat.cli.parser import CommandParser
 from offbeat.cli.train import train_command
@@ -578,3 +581,58 @@ def test_options_of_the_training_replace_those_of_the_recipe(data, tmp_path):
     assert main([*arguments, "--training.learning_rate=0.01", "--training.keep=last"]) == 0
     config = yaml.safe_load((tmp_path / "config.yaml").read_text())["training"]
     assert (config["learning_rate"], config["keep"], config["clip_norm"]) == (0.01, "last", 1.0)
+
+
+def test_the_help_of_train_has_ten_options_first_and_the_rest_under_help_all(capsys):
+    said = {}
+    for option in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as stop:
+            main(["train", option])
+        assert stop.value.code == 0
+        text = capsys.readouterr().out
+        said[option] = re.findall(r"^  (?:-h, )?--([\w.-]+)", text, re.MULTILINE)
+    assert said["--help"][:10] == list(FREQUENT["train"])
+    assert said["--help"][10:] == ["help", "help-all", "config", "quiet", "verbose"]
+    assert {*said["--help"], "model.hidden_size", "reader.max_gap_s"} <= set(said["--help-all"])
+    assert len(said["--help-all"]) > 100
+
+
+def test_quiet_prints_results_and_errors_alone(tmp_path, capsys):
+    def noted() -> None:
+        """Say something."""
+        print("a note", file=sys.stderr)
+        print("a result")
+        if (tmp_path / "broken").exists():
+            raise ob.InputError("it is broken")
+
+    commands = {"go": noted}
+    assert run_commands(commands, ["go", "--quiet"], prog="test", description="") == 0
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("a result\n", "")
+    (tmp_path / "broken").touch()
+    assert run_commands(commands, ["go", "--quiet"], prog="test", description="") == 2
+    assert capsys.readouterr().err == "offbeat: error: it is broken\n"
+    assert run_commands(commands, ["go", "--verbose"], prog="test", description="") == 2
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert "a note" in said
+    assert re.search(r"^offbeat: \d+\.\d s$", said, re.MULTILINE)
+
+
+def test_a_long_step_shows_its_time_on_a_terminal_alone(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    for stream, shown in ((Terminal(), True), (io.StringIO(), False)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        monkeypatch.setattr(progress, "_AFTER_S", 0.05)
+        monkeypatch.setattr(progress, "_EVERY_S", 0.01)
+        with progress.busy("filling"):
+            time.sleep(0.4)
+        assert ("filling: 00:0" in stream.getvalue()) == shown
+        with progress.busy("reading"):
+            pass
+        assert "reading" not in stream.getvalue()
+        with pytest.raises(KeyError), progress.busy("scoring"):
+            raise KeyError

@@ -19,6 +19,7 @@ STAGES = (
     "files",
     "safe_yaml",
     "tables",
+    "progress",
     "config",
     "data",
     "baselines",

@@ -20,6 +20,7 @@ from offbeat.data.trajectory import Dataset
 from offbeat.ladder import CANDIDATES, LadderResult, fit_ladder
 from offbeat.models.base import BaseModel
 from offbeat.models.zoo import make_model
+from offbeat.progress import busy
 from offbeat.training import FitResult, fit
 
 BUDGET_S = 240.0
@@ -236,16 +237,17 @@ def train_blend(
     masked = any(masked_values(t).any() for t in train)
     names = SIMPLE if baselines is None and as_it_is else baselines
     members: dict[str, Any] = {} if names is None else by_direction(names)
-    blend = fit_blend(
-        train,
-        validation,
-        forward,
-        backward,
-        tasks=tasks,
-        masks_of_data=as_it_is and masked,
-        seed=seed,
-        **members,
-    )
+    with busy("fitting baselines, weights and intervals", progress):
+        blend = fit_blend(
+            train,
+            validation,
+            forward,
+            backward,
+            tasks=tasks,
+            masks_of_data=as_it_is and masked,
+            seed=seed,
+            **members,
+        )
     if folder is not None:
         save_blend(blend, folder)
     return blend, fitted, (*said, *blend.notes())

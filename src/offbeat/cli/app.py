@@ -7,9 +7,13 @@ Torch and everything else that is slow to import is imported inside the function
 from __future__ import annotations
 
 import inspect
+import logging
 import os
 import sys
-from collections.abc import Sequence
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from typing import Any
 
 from offbeat.cli.compare import compare_command
@@ -31,6 +35,14 @@ from offbeat.errors import OffbeatError, printable
 
 DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
 
+From a log to predictions, fills and forecasts with intervals:
+
+  offbeat inspect arm.csv
+  offbeat train arm.csv runs/arm
+  offbeat impute runs/arm arm.csv filled.csv
+  offbeat forecast runs/arm arm.csv ahead.csv --horizons 0.1,0.5
+  offbeat resample arm.csv arm --rate_hz 30 --run runs/arm
+
 From simulation to a scored model:
 
   offbeat simulate hopper.parquet --n_trajectories 2000
@@ -40,7 +52,6 @@ From simulation to a scored model:
   offbeat impute runs/hopper hopper.parquet filled.csv
   offbeat forecast runs/hopper hopper.parquet ahead.csv --horizons 0.05,0.1
 
-For a log of your own, start with: offbeat inspect LOG
 To compare several models: offbeat demo"""
 
 
@@ -66,6 +77,23 @@ COMMANDS: dict[str, Any] = {
 
 ALIASES = {"forecast": ("extrapolate",)}
 """Aliases of commands."""
+
+
+FREQUENT = {
+    "train": (
+        "budget_minutes",
+        "horizon_s",
+        "model.name",
+        "baselines",
+        "two_sided",
+        "reader.format",
+        "reader.time_column",
+        "reader.time_unit",
+        "seed",
+        "device",
+    ),
+}
+"""Options that `--help` shows first; by default those in no group. The rest is in `--help-all`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -103,7 +131,7 @@ def run_commands(
     parsers: dict[str, CommandParser] = {}
     for command, function in commands.items():
         about = inspect.cleandoc(function.__doc__ or "").partition("\n\n")[0]
-        parsers[command] = CommandParser(function, groups, description=about)
+        parsers[command] = CommandParser(function, groups, FREQUENT.get(command), description=about)
         aliases = ALIASES.get(command, ())
         subcommands.add_subcommand(command, parsers[command], help=about, aliases=aliases)
         parsers[command].prog = f"{prog} {command}"
@@ -114,7 +142,8 @@ def run_commands(
         command = names[parsed.subcommand]
         options = parser.instantiate(parsed)[parsed.subcommand].as_dict()
         options.pop("config", None)
-        commands[command](**options)
+        with _said(quiet=options.pop("quiet"), verbose=options.pop("verbose")):
+            commands[command](**options)
     except ArgumentError as error:
         return _fail(str(error), 2)
     except RecursionError:
@@ -130,6 +159,33 @@ def run_commands(
     except KeyboardInterrupt:
         return _fail("interrupted; the same command continues from the last checkpoint", 130)
     return 0
+
+
+@contextmanager
+def _said(*, quiet: bool, verbose: bool) -> Iterator[None]:
+    """Standard error without notes and bars, or with the time and the place of an error."""
+    if quiet:
+        with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stderr(nowhere):
+            yield
+        return
+    if not verbose:
+        yield
+        return
+    began = time.monotonic()
+    logger, handler = logging.getLogger("offbeat"), logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    except Exception:
+        traceback.print_exc()
+        raise
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+        print(f"offbeat: {time.monotonic() - began:.1f} s", file=sys.stderr)
 
 
 def _fail(message: str, code: int) -> int:

@@ -14,6 +14,7 @@ from offbeat.cli.common import (
 )
 from offbeat.config import MASKS, check_seed
 from offbeat.errors import InputError, one_of
+from offbeat.progress import busy
 
 
 def evaluate_command(
@@ -114,9 +115,10 @@ def evaluate_command(
     chosen = plotted_channels(loaded.names, channels)
     one_trajectory(dataset, trajectory)
     evaluation = None if forward is None else evaluate(forward, dataset, seed=seed)
-    scores, text = scored(
-        loaded, dataset, evaluation, horizons=after, seed=seed, calibration=calibration
-    )
+    with busy("scoring"):
+        scores, text = scored(
+            loaded, dataset, evaluation, horizons=after, seed=seed, calibration=calibration
+        )
     result = {"part": part, **scores}
     if out is not None:
         write_json(out, result)

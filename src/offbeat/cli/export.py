@@ -6,6 +6,7 @@ from pathlib import Path
 
 from offbeat.cli.common import say
 from offbeat.errors import one_of
+from offbeat.progress import busy
 
 
 def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False) -> None:
@@ -29,7 +30,8 @@ def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False)
 
     writable(out)
     loaded = load_run(model)
-    export_onnx(loaded, out)
+    with busy("exporting"):
+        export_onnx(loaded, out)
     size = out.stat().st_size
     result = {"written": str(out), "model": loaded.name, "bytes": size}
     say(result, f"{out}: one step of {loaded.name}, {size} bytes", json)

@@ -15,6 +15,7 @@ from offbeat.cli.common import (
     say,
 )
 from offbeat.errors import InputError
+from offbeat.progress import busy
 
 
 def forecast_command(
@@ -62,7 +63,8 @@ def forecast_command(
     after = checked_horizons(horizons)
     loaded = load_run(model)
     dataset = read_log(data, reader, run=model)
-    predicted = forecast(loaded, dataset, after)
+    with busy("forecasting"):
+        predicted = forecast(loaded, dataset, after)
     chosen = plotted_channels(predicted.names, channels)
     one_trajectory(dataset, trajectory)
     columns = answer_columns(dataset, predicted)

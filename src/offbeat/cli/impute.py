@@ -16,6 +16,7 @@ from offbeat.cli.common import (
 )
 from offbeat.cli.written import check_answers, write_answers
 from offbeat.config import check_seed
+from offbeat.progress import busy
 
 
 def impute_command(
@@ -74,7 +75,8 @@ def impute_command(
     if rate_hz is not None and "max_gap_s" in known_options(data, reader, run=model):
         reader = {"max_gap_s": None, **(reader or {})}
     dataset = read_log(data, reader, run=model)
-    filled = impute(loaded, dataset, mode=mode, rate_hz=rate_hz, seed=seed)  # type: ignore[arg-type]
+    with busy("filling"):
+        filled = impute(loaded, dataset, mode=mode, rate_hz=rate_hz, seed=seed)  # type: ignore[arg-type]
     chosen = plotted_channels(filled.names, channels)
     one_trajectory(dataset, trajectory)
     name = write_answers(out, dataset, filled, format=format, data=data)

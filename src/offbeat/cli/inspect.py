@@ -7,6 +7,7 @@ from typing import Any
 
 from offbeat.cli.common import say, without_warnings
 from offbeat.errors import InputError, one_of
+from offbeat.progress import busy
 
 _FINISHED = (
     "a data set in the format of Offbeat is taken as it is: nothing is cleaned or left out",
@@ -42,7 +43,8 @@ def inspect_command(
     # The warnings of the reader are part of the output.
     with without_warnings():
         dataset = read(data, **(reader or {}))
-    inspection = inspect(dataset)
+    with busy("inspecting"):
+        inspection = inspect(dataset)
     known = READERS[inspection.format].options if inspection.format in READERS else ()
     result = inspection.to_dict()
     try:

@@ -72,6 +72,8 @@ class CommandParser(ArgumentParser):
             under `Args:` are the options.
         groups: options of an argument that is a mapping, by the argument's name, made when they are
             needed.
+        frequent: names of the options that `--help` shows; the rest is under `--help-all`. By
+            default those that are in no group.
         **options: of `jsonargparse.ArgumentParser`.
     """
 
@@ -79,19 +81,26 @@ class CommandParser(ArgumentParser):
         self,
         function: Callable[..., None] | None = None,
         groups: Mapping[str, Callable[[], Sequence[Option]]] | None = None,
+        frequent: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
         super().__init__(
             formatter_class=Formatter, exit_on_error=False, allow_abbrev=False, **options
         )
         self.function, self.groups_of, self.is_filled = function, groups or {}, False
+        self.frequent = frequent
 
     def fill(self) -> None:
         """Adds the options of the function; called only for the command that runs."""
         if self.is_filled or self.function is None:
             return
         self.is_filled = True
+        self.add_argument("--help-all", action=_HelpAll, help="Show every option and exit.")
         self.add_argument("--config", action=_Config, help="YAML file with options.")
+        said = "print results and errors alone: no notes, warnings and progress bars."
+        self.add_argument("--quiet", type=bool, default=False, help=said)
+        said = "print more: times, the log of each step, and where an error comes from."
+        self.add_argument("--verbose", type=bool, default=False, help=said)
         groups = self.groups_of.keys() & inspect.signature(self.function).parameters.keys()
         self.add_function_arguments(
             self.function, as_group=False, as_positional=True, sub_configs=True, skip=set(groups)
@@ -110,6 +119,34 @@ class CommandParser(ArgumentParser):
                     action._typehint, action.nargs, action.metavar = kind.__args__[0], "+", None
         paths = (action.dest for action in actions if not action.option_strings)
         self.usage = f"{self.prog} [options] {' '.join(paths)}"
+
+    def format_help(self, formatter: Any = None) -> str:
+        """The help with the frequent options alone, in their order."""
+        if self.function is None:
+            return str(super().format_help(formatter))
+        self.fill()
+        actions = {a.option_strings[0].lstrip("-"): a for a in self._actions if a.option_strings}
+        names = self.frequent or [name for name in actions if "." not in name]
+        first = ["help", "help-all", "config", "quiet", "verbose"]
+        names = [*dict.fromkeys([*(n for n in names if n not in ("h", "print_config")), *first])]
+        shown = [actions["h" if name == "help" else name] for name in names]
+        formatter = formatter or self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        formatter.start_section("positional arguments")
+        formatter.add_arguments([a for a in self._actions if not a.option_strings])
+        formatter.end_section()
+        formatter.start_section("options")
+        formatter.add_arguments(shown)
+        formatter.end_section()
+        more = len(actions) - len(shown)
+        if more > 1:
+            formatter.add_text(f"{more} more options: {self.prog} --help-all")
+        return str(formatter.format_help())
+
+    def format_help_all(self) -> str:
+        """The help with every option."""
+        return str(super().format_help())
 
     def _make_flag(self, option: argparse.Action) -> None:
         """Allows an option of type bool without a value, or with true or false."""
@@ -235,6 +272,18 @@ class CommandParser(ArgumentParser):
             alone = rf"{start}{name}(?![\w.='\"|/])" if "_" in name else f"^{name}(?= must)"
             message = re.sub(alone, option, message)
         return message
+
+
+class _HelpAll(argparse.Action):
+    """Prints the help with every option."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str = "") -> None:
+        nothing = argparse.SUPPRESS
+        super().__init__(option_strings, nothing, nargs=0, default=nothing, help=help)
+
+    def __call__(self, parser: Any, *_: Any, **__: Any) -> None:
+        print(parser.format_help_all(), end="")
+        parser.exit()
 
 
 class _Config(ActionConfigFile):

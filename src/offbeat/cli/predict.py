@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from offbeat.cli.common import answer_columns, check_out, read_log, reader_options, say
 from offbeat.config import check_seed
 from offbeat.errors import InputError
+from offbeat.progress import busy
 
 if TYPE_CHECKING:
     from offbeat.data.trajectory import Dataset
@@ -62,7 +63,8 @@ def predict_command(
     dataset = read_log(data, reader, run=model)
     if times is not None:
         _check_since(dataset, times)
-    predicted = predict(loaded, dataset, times=times, seed=seed)
+    with busy("predicting"):
+        predicted = predict(loaded, dataset, times=times, seed=seed)
     columns = answer_columns(dataset, predicted, masks=False)
     rows = sum(t.rows for t in predicted)
     write_table(out, columns)

@@ -9,6 +9,7 @@ from offbeat.cli.common import known_options, read_log, say
 from offbeat.cli.written import check_answers, write_answers
 from offbeat.config import check_seed
 from offbeat.errors import InputError
+from offbeat.progress import busy
 
 
 def resample_command(
@@ -49,7 +50,8 @@ def resample_command(
     if run is None and "outliers" in known_options(data, reader):
         reader = {"outliers": "mask", **(reader or {})}
     dataset = read_log(data, reader, run=run)
-    even = resample(dataset, rate_hz, model, seed=seed)
+    with busy("filling"):
+        even = resample(dataset, rate_hz, model, seed=seed)
     name = write_answers(out, dataset, even, format=format, data=data, rate_hz=rate_hz)
     rows, total = sum(t.rows for t in even), sum(t.observed.size for t in even)
     filled = total - sum(int(t.observed.sum()) for t in even)

@@ -10,6 +10,7 @@ from typing import Any
 from offbeat.cli.common import FOUND, READER_FILE, plain, read_planned, say
 from offbeat.config import ModelConfig, SplitConfig, TrainConfig, check_seed, from_mapping
 from offbeat.errors import InputError, one_of
+from offbeat.progress import busy
 
 
 def train_command(
@@ -87,9 +88,11 @@ def train_command(
     config: TrainConfig = from_mapping(TrainConfig, {"seed": seed, **(training or {})})
     torch.set_num_threads(threads)
     open_split = split == SplitConfig(seed=split.seed)
-    dataset, chosen = read_planned(
-        data, reader, horizon_s=horizon_s, split=None if open_split else split, seed=split.seed
-    )
+    given_split = None if open_split else split
+    with busy("reading and inspecting the log"):
+        dataset, chosen = read_planned(
+            data, reader, horizon_s=horizon_s, split=given_split, seed=split.seed
+        )
     if chosen is not None:
         reader, split = dict(chosen.reader), chosen.split
         for note in chosen.notes:
@@ -136,7 +139,8 @@ def train_command(
     if reader or "found" in dataset.meta:
         kept = {**(reader or {}), FOUND: dataset.meta.get("found", {})}
         write_json(out / READER_FILE, kept)
-    scores, text = scored(blend, learned.test, evaluate(made, learned.test))
+    with busy("scoring the test part"):
+        scores, text = scored(blend, learned.test, evaluate(made, learned.test))
     result = {"steps": learned.fit.steps, "part": "test", **scores}
     write_json(out / "results.json", result)
     heading = f"{out}: {learned.fit.steps} steps; scores of the test part"
