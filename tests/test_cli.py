@@ -592,7 +592,7 @@ def test_the_help_of_train_has_ten_options_first_and_the_rest_under_help_all(cap
         text = capsys.readouterr().out
         said[option] = re.findall(r"^  (?:-h, )?--([\w.-]+)", text, re.MULTILINE)
     assert said["--help"][:10] == list(FREQUENT["train"])
-    assert said["--help"][10:] == ["help", "help-all", "config", "quiet", "verbose"]
+    assert said["--help"][10:] == ["help", "config", "quiet", "verbose"]
     assert {*said["--help"], "model.hidden_size", "reader.max_gap_s"} <= set(said["--help-all"])
     assert len(said["--help-all"]) > 100
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from offbeat.data.batch import Batch
     from offbeat.data.frames import from_pandas, to_pandas
     from offbeat.data.inspection import inspect
+    from offbeat.data.loaders import data_loader
     from offbeat.data.masking import mask_out
     from offbeat.data.readers import read, register_reader
     from offbeat.data.robots import register_robot
@@ -71,6 +72,7 @@ _PUBLIC = {
     "StreamOptions": "stream.options",
     "Trajectory": "data.trajectory",
     "compare": "comparison",
+    "data_loader": "data.loaders",
     "evaluate": "evaluation",
     "export_onnx": "export.exporter",
     "fit": "training",
@@ -172,6 +174,7 @@ __all__ = [
     "Trajectory",
     "baselines",
     "compare",
+    "data_loader",
     "evaluate",
     "export_onnx",
     "fit",

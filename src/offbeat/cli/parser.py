@@ -95,7 +95,6 @@ class CommandParser(ArgumentParser):
         if self.is_filled or self.function is None:
             return
         self.is_filled = True
-        self.add_argument("--help-all", action=_HelpAll, help="Show every option and exit.")
         self.add_argument("--config", action=_Config, help="YAML file with options.")
         said = "print results and errors alone: no notes, warnings and progress bars."
         self.add_argument("--quiet", type=bool, default=False, help=said)
@@ -127,7 +126,7 @@ class CommandParser(ArgumentParser):
         self.fill()
         actions = {a.option_strings[0].lstrip("-"): a for a in self._actions if a.option_strings}
         names = self.frequent or [name for name in actions if "." not in name]
-        first = ["help", "help-all", "config", "quiet", "verbose"]
+        first = ["help", "config", "quiet", "verbose"]
         names = [*dict.fromkeys([*(n for n in names if n not in ("h", "print_config")), *first])]
         shown = [actions["h" if name == "help" else name] for name in names]
         formatter = formatter or self._get_formatter()
@@ -171,6 +170,9 @@ class CommandParser(ArgumentParser):
         """Parses arguments; values of a config apply to options that are not given."""
         self.fill()
         if self.function is not None:
+            if "--help-all" in args:
+                print(self.format_help_all(), end="")
+                self.exit()
             try:
                 safe_yaml.check_value([text.partition("=")[2] or text for text in args])
             except yaml.YAMLError as error:
@@ -272,18 +274,6 @@ class CommandParser(ArgumentParser):
             alone = rf"{start}{name}(?![\w.='\"|/])" if "_" in name else f"^{name}(?= must)"
             message = re.sub(alone, option, message)
         return message
-
-
-class _HelpAll(argparse.Action):
-    """Prints the help with every option."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, help: str = "") -> None:
-        nothing = argparse.SUPPRESS
-        super().__init__(option_strings, nothing, nargs=0, default=nothing, help=help)
-
-    def __call__(self, parser: Any, *_: Any, **__: Any) -> None:
-        print(parser.format_help_all(), end="")
-        parser.exit()
 
 
 class _Config(ActionConfigFile):

@@ -10,36 +10,67 @@ import numpy as np
 
 from offbeat.data.arrays import hand_over
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.writers.described import interval
 from offbeat.errors import InputError, MissingExtraError, one_of
 
+_BESIDE = ("observed", "low", "high", "beyond")
 
-def to_pandas(dataset: Dataset) -> Any:
-    """Converts a data set to a data frame.
 
-    A value is NaN where it is not observed, as `from_pandas` reads it. Values that are known and
-    masked are lost; units and roles are in the frame's `attrs`.
+def to_pandas(
+    dataset: Dataset | Trajectory, *, masks: bool = False, level: float | None = None
+) -> Any:
+    """Converts a data set, or one trajectory, to a data frame.
+
+    A value is NaN where it is not observed, as `from_pandas` reads it, and values that are known
+    and masked are lost; with `masks` all known values are kept. Units and roles are in the frame's
+    `attrs`. pandas converts further: `to_pandas(trajectory).to_xarray()` is a data set of xarray
+    with the coordinate `time`.
 
     Args:
-        dataset: the data set.
+        dataset: a data set, or a trajectory.
+        masks: add a column `name|observed` per channel, True where it is observed.
+        level: probability of the intervals of answers, whose ends are then columns `name|low` and
+            `name|high`.
 
     Returns:
-        A `pandas.DataFrame`; `trajectory` counts from 0, `time` is in seconds.
+        A `pandas.DataFrame`. Of a data set it has a row per time, `trajectory` counts from 0, and
+        `time` is in seconds. Of a trajectory, the index is `time`, in seconds.
 
     Raises:
-        InputError: a channel is called `trajectory` or `time`.
+        InputError: a channel has the name of another column, or there are no intervals.
         MissingExtraError: pandas is not installed.
+
+    Example:
+        >>> frames = [offbeat.to_pandas(one, masks=True) for one in log]  # doctest: +SKIP
     """
     pandas = _pandas()
-    for name in ("trajectory", "time"):
-        if name in dataset.names:
-            raise InputError(f"a channel is called {name!r}, as a column of the frame; rename it")
-    values = np.concatenate([np.where(t.observed, t.values, np.nan) for t in dataset])
-    frame = pandas.DataFrame(values, columns=list(dataset.names))
-    frame.insert(0, "time", np.concatenate([t.times for t in dataset]))
-    frame.insert(0, "trajectory", np.repeat(np.arange(len(dataset)), [t.rows for t in dataset]))
+    alone = isinstance(dataset, Trajectory)
+    dataset = Dataset.of(dataset)
+    values = [t.values if masks else np.where(t.observed, t.values, np.nan) for t in dataset]
+    columns: dict[str, Any] = (
+        {}
+        if alone
+        else {"trajectory": np.repeat(np.arange(len(dataset)), [t.rows for t in dataset])}
+    )
+    columns["time"] = np.concatenate([t.times for t in dataset])
+    tables = {"": np.concatenate(values)}
+    if masks:
+        tables["|observed"] = np.concatenate([t.observed for t in dataset])
+    if level is not None:
+        ends = [_interval(t, level) for t in dataset]
+        tables["|low"], tables["|high"] = (np.concatenate(side) for side in zip(*ends, strict=True))
+    for ending, table in tables.items():
+        for c, name in enumerate(dataset.names):
+            if name + ending in columns:
+                raise InputError(
+                    f"a channel is called {name + ending!r}, as another column of the frame; "
+                    "rename it"
+                )
+            columns[name + ending] = table[:, c]
+    frame = pandas.DataFrame(columns)
     frame.attrs["units"] = dict(zip(dataset.names, dataset.units, strict=True))
     frame.attrs["roles"] = dict(zip(dataset.names, dataset.roles, strict=True))
-    return frame
+    return frame.set_index("time") if alone else frame
 
 
 def from_pandas(
@@ -50,11 +81,15 @@ def from_pandas(
     units: Mapping[str, str] | None = None,
     roles: Mapping[str, str] | None = None,
 ) -> Dataset:
-    """Converts a data frame with a row per time to a data set.
+    """Converts data frames with a row per time to a data set.
+
+    A column `name|observed` beside the channel `name` is its mask, as `to_pandas` writes it;
+    columns `name|low`, `name|high` and `name|beyond` are left out.
 
     Args:
-        frame: a `pandas.DataFrame`; all columns except `time` and `by` are numeric channels.
-        time: column of times: seconds, or time stamps or durations of pandas.
+        frame: a `pandas.DataFrame`; all columns except `time` and `by` are numeric channels. Or a
+            list of them, a trajectory each.
+        time: column of times, or name of the index: seconds, or time stamps or durations of pandas.
         by: column with the trajectory of each row; by default `trajectory` where there
             is one, else the frame is one trajectory. Trajectories are in the order of their first
             rows.
@@ -71,17 +106,26 @@ def from_pandas(
         MissingExtraError: pandas is not installed.
     """
     _pandas()
+    if isinstance(frame, list | tuple):
+        parts = [from_pandas(f, time=time, by=by, units=units, roles=roles) for f in frame]
+        return Dataset(tuple(t for part in parts for t in part))
     columns = list(frame.columns)
-    one_of("column of times", time, columns)
+    if time not in columns and frame.index.name == time:
+        attrs = frame.attrs
+        frame = frame.reset_index()
+        frame.attrs = attrs
+        columns = list(frame.columns)
+    one_of("column of times", time, map(str, columns))
     if by is None and "trajectory" in columns and time != "trajectory":
         by = "trajectory"
     if by is not None:
-        one_of("column of trajectories", by, columns)
-    names = [name for name in columns if name not in (time, by)]
+        one_of("column of trajectories", by, map(str, columns))
+    beside = {f"{name}|{what}" for name in columns for what in _BESIDE}
+    names = [name for name in columns if name not in (time, by) and str(name) not in beside]
     described: list[tuple[str, ...]] = []
     for key, given, default in (("units", units, ""), ("roles", roles, "state")):
         for name in given or {}:
-            one_of(f"channel in {key}", name, names)
+            one_of(f"channel in {key}", name, map(str, names))
         found = {**frame.attrs.get(key, {}), **(given or {})}
         described.append(tuple(found.get(name, default) for name in names))
     clock, nanoseconds = _clock(frame[time], time)
@@ -89,6 +133,10 @@ def from_pandas(
         values = frame[names].to_numpy(dtype=np.float64, na_value=np.nan)
     except (TypeError, ValueError) as error:
         raise InputError(f"the channels {names} of the frame must be numbers: {error}") from None
+    observed = ~np.isnan(values)
+    for c, name in enumerate(names):
+        if f"{name}|observed" in columns:
+            observed[:, c] &= frame[f"{name}|observed"].to_numpy(dtype=bool)
     rows = [np.arange(len(frame))]
     if by is not None:
         rows = list(frame.groupby(by, sort=False, dropna=False).indices.values())
@@ -99,6 +147,7 @@ def from_pandas(
                 clock[index],
                 hand_over(values[index]),
                 time_unit="ns" if nanoseconds else "s",
+                observed=hand_over(observed[index]),
                 names=tuple(map(str, names)),
                 units=described[0],
                 roles=described[1],
@@ -106,6 +155,16 @@ def from_pandas(
             for index in rows
         )
     )
+
+
+def _interval(trajectory: Trajectory, level: float) -> tuple[Any, Any]:
+    ends = interval(trajectory, level)
+    if ends is None:
+        raise InputError(
+            "level is given, and these values have no intervals: they are no answers of a blend; "
+            "leave it out"
+        )
+    return ends
 
 
 def _pandas() -> Any:
