@@ -47,6 +47,12 @@ MUTANTS ?= 1000
 fuzz: .venv/.test ## read MUTANTS damaged files of every format
 	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz.py --mutants $(MUTANTS)
 
+KILLS ?= 200
+
+.PHONY: torture
+torture: .venv/.test ## kill commands at KILLS random file operations, and resume them
+	OMP_NUM_THREADS=1 $(BIN)/python tests/torture.py --kills $(KILLS)
+
 # The kernel's tests with the address and undefined-behaviour sanitizers, in a build of its own.
 SANITIZED := build/sanitized
 RUNTIME = $(shell $(CXX) -print-file-name=libasan.so) $(shell $(CXX) -print-file-name=libstdc++.so)

@@ -96,7 +96,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-_LEFT_S = 60.0
+_LEFT_S = 2.0
 """Age from which a temporary file that no process holds is one that a killed process left."""
 
 
@@ -124,6 +124,22 @@ def _lock(handle: int) -> bool:
     return True
 
 
+_TEMPORARY = re.compile(r"\.(.+?)\.(?:old\.)?[a-z0-9_]{8}(?:\.\w+)?")
+"""Names of temporary files and folders, with that of the file that was written."""
+
+
+def clean(folder: Path) -> None:
+    """Removes what killed processes left below a folder, which must be one that Offbeat writes.
+
+    Args:
+        folder: of a run or a sweep.
+    """
+    for left in list(folder.rglob(".*")):
+        found = _TEMPORARY.fullmatch(left.name)
+        if found:
+            _remove_left(left.with_name(found[1]))
+
+
 def _remove_left(path: Path) -> None:
     """Removes temporary files and folders for `path` that killed processes left.
 
@@ -132,8 +148,11 @@ def _remove_left(path: Path) -> None:
     pattern = re.compile(
         rf"\.{re.escape(path.name)}\.(old\.)?[a-z0-9_]{{8}}({re.escape(path.suffix)})?"
     )
-    with os.scandir(path.parent) as entries:
-        names = [entry.name for entry in entries if pattern.fullmatch(entry.name)]
+    try:
+        with os.scandir(path.parent) as entries:
+            names = [entry.name for entry in entries if pattern.fullmatch(entry.name)]
+    except FileNotFoundError:  # it was inside of one that was removed
+        return
     for name in names:
         left = path.parent / name
         try:

@@ -11,6 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from torch import Tensor
 from offbeat.config import Recipe
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.files import write_text
+from offbeat.files import clean, write_text
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_training_state, save_training_state
 from offbeat.models.corrected import CorrectedModel
@@ -149,11 +150,16 @@ LADDER = "ladder"
 """Subfolder of the trainings from which `fit_ladder` chooses."""
 
 
+_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
+"""Folders that this thread has locked."""
+
+
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Locks the folder of a run for this process, for as long as the block runs.
 
-    The lock of a process that has ended, however it ended, is void.
+    The lock of a process that has ended, however it ended, is void, and temporary files that it
+    left are removed. Inside of the block, the same thread can lock the folder again.
 
     Args:
         folder: of the run; made if it is missing.
@@ -162,6 +168,9 @@ def locked(folder: Path) -> Iterator[None]:
         InputError: another training uses it.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    if folder.resolve() in _held.get():
+        yield
+        return
     with (folder / LOCK).open("a+", encoding="utf-8") as file:
         if os.name == "posix":
             import fcntl
@@ -177,7 +186,12 @@ def locked(folder: Path) -> Iterator[None]:
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
-        yield
+        clean(folder)
+        token = _held.set(_held.get() | {folder.resolve()})
+        try:
+            yield
+        finally:
+            _held.reset(token)
 
 
 def identity_of(

@@ -6,6 +6,7 @@ Torch and everything else that is slow to import is imported inside the function
 
 from __future__ import annotations
 
+import errno
 import inspect
 import logging
 import os
@@ -153,8 +154,8 @@ def run_commands(
         return 1
     except (OffbeatError, OSError) as error:
         said = parsers[command].spoken(str(error)) if command else str(error)
-        if isinstance(error, OSError) and error.filename is None and error.strerror:
-            said = f"the output can't be written: {error.strerror}"
+        if isinstance(error, OSError) and error.strerror:
+            said = _of_system(error, said)
         return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
     except KeyboardInterrupt:
         return _fail("interrupted; the same command continues from the last checkpoint", 130)
@@ -186,6 +187,15 @@ def _said(*, quiet: bool, verbose: bool) -> Iterator[None]:
         logger.removeHandler(handler)
         logger.setLevel(level)
         print(f"offbeat: {time.monotonic() - began:.1f} s", file=sys.stderr)
+
+
+def _of_system(error: OSError, said: str) -> str:
+    """What an error of the system says to a user: which file it is about, and what to do."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        where = error.filename or "the output"
+        why = os.strerror(error.errno)
+        return f"{where} can't be written: {why}; free some space, then repeat the command"
+    return said if error.filename else f"the output can't be written: {error.strerror}"
 
 
 def _fail(message: str, code: int) -> int:

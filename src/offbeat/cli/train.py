@@ -70,6 +70,7 @@ def train_command(
     from offbeat.files import writable, write_json, write_text
     from offbeat.learning import learn
     from offbeat.models.zoo import MODELS
+    from offbeat.run import locked
 
     if scaler is not None:
         one_of("scaler", scaler, SCALERS)
@@ -99,52 +100,53 @@ def train_command(
             print(f"offbeat: {note}", file=sys.stderr)
     as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
     open_model = model == ModelConfig()
-    learned = learn(
-        dataset,
-        out,
-        horizon_s=horizon_s,
-        model=None if open_model and not as_it_is else model,
-        training=config,
-        split=split,
-        chosen=chosen,
-        as_it_is=as_it_is,
-        two_sided=not as_it_is if two_sided is None else two_sided,
-        baselines=baselines,
-        scaler=scaler,  # type: ignore[arg-type]
-        budget_s=60 * budget_minutes,
-        seed=seed,
-        device=device,
-    )
-    for note in learned.notes[len(() if chosen is None else chosen.notes) :]:
-        print(f"offbeat: {note}", file=sys.stderr)
-    blend, made = learned.blend, learned.blend.forward
-    assert made is not None
-    resolved = {
-        "data": str(data),
-        "out": str(out),
-        "model": _resolved(made, model),
-        "training": plain(asdict(learned.fit.recipe)),
-        "split": plain(asdict(learned.split)),
-        "scaler": made.scaler.kind,
-        "horizon_s": blend.tasks.horizon_s,
-        "two_sided": blend.backward is not None,
-        "baselines": [*blend.stack.members, *blend.both.members],
-        "reader": reader,
-        "seed": seed,
-        "threads": threads,
-        "device": device,
-    }
-    write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
-    save_split(out / "split.json", learned.split, dataset)
-    if reader or "found" in dataset.meta:
-        kept = {**(reader or {}), FOUND: dataset.meta.get("found", {})}
-        write_json(out / READER_FILE, kept)
-    with busy("scoring the test part"):
-        scores, text = scored(blend, learned.test, evaluate(made, learned.test))
-    result = {"steps": learned.fit.steps, "part": "test", **scores}
-    write_json(out / "results.json", result)
-    heading = f"{out}: {learned.fit.steps} steps; scores of the test part"
-    say(result, f"{heading}\n{text}", json)
+    with locked(out):
+        learned = learn(
+            dataset,
+            out,
+            horizon_s=horizon_s,
+            model=None if open_model and not as_it_is else model,
+            training=config,
+            split=split,
+            chosen=chosen,
+            as_it_is=as_it_is,
+            two_sided=not as_it_is if two_sided is None else two_sided,
+            baselines=baselines,
+            scaler=scaler,  # type: ignore[arg-type]
+            budget_s=60 * budget_minutes,
+            seed=seed,
+            device=device,
+        )
+        for note in learned.notes[len(() if chosen is None else chosen.notes) :]:
+            print(f"offbeat: {note}", file=sys.stderr)
+        blend, made = learned.blend, learned.blend.forward
+        assert made is not None
+        resolved = {
+            "data": str(data),
+            "out": str(out),
+            "model": _resolved(made, model),
+            "training": plain(asdict(learned.fit.recipe)),
+            "split": plain(asdict(learned.split)),
+            "scaler": made.scaler.kind,
+            "horizon_s": blend.tasks.horizon_s,
+            "two_sided": blend.backward is not None,
+            "baselines": [*blend.stack.members, *blend.both.members],
+            "reader": reader,
+            "seed": seed,
+            "threads": threads,
+            "device": device,
+        }
+        write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
+        save_split(out / "split.json", learned.split, dataset)
+        if reader or "found" in dataset.meta:
+            kept = {**(reader or {}), FOUND: dataset.meta.get("found", {})}
+            write_json(out / READER_FILE, kept)
+        with busy("scoring the test part"):
+            scores, text = scored(blend, learned.test, evaluate(made, learned.test))
+        result = {"steps": learned.fit.steps, "part": "test", **scores}
+        write_json(out / "results.json", result)
+        heading = f"{out}: {learned.fit.steps} steps; scores of the test part"
+        say(result, f"{heading}\n{text}", json)
 
 
 def _resolved(made: Any, given: ModelConfig) -> dict[str, Any]:

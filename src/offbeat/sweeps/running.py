@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
-from offbeat.files import writable, write_json
+from offbeat.files import clean, writable, write_json
 from offbeat.sweeps.engines import engine_named
 from offbeat.sweeps.plan import Plan, Run
 from offbeat.sweeps.progress import Progress, duration
@@ -172,6 +172,7 @@ def _alone(out: Path) -> Iterator[None]:
                     f"another process uses {out} (see {out / 'status.json'}); wait until it ends, "
                     "or give another folder"
                 ) from None
+        clean(out)
         yield
 
 
