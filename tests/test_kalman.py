@@ -11,7 +11,7 @@ from scipy.linalg import expm
 import offbeat as ob
 from offbeat.baselines import fit_baseline
 from offbeat.baselines.base import Rows, padded
-from offbeat.baselines.kalman import Chains, filtered, transition
+from offbeat.baselines.kalman import Belief, Chains, filtered, transition
 
 DAMPINGS = (0.0, 1e-3, 0.299, 0.301, 1.0, 3.0)
 GAPS = (1e-6, 1e-2, 0.5, 1.0, 4.0)
@@ -373,3 +373,84 @@ def test_data_that_tell_little_give_finite_predictions(name):
         assert np.isfinite(np.concatenate([a.ravel() for a in fitted.arrays().values()])).all(), (
             what
         )
+
+
+# --- wild values ----------------------------------------------------------------------------------
+
+
+def wild(trajectory, row, size):
+    """The same with a value of one row that is wrong."""
+    values = trajectory.values.copy()
+    values[row] += size
+    return ob.Trajectory(trajectory.times, values, observed=trajectory.observed)
+
+
+def with_limits(baseline, limit):
+    """A fitted baseline with other limits of innovations."""
+    arrays = baseline.arrays()
+    limits = {n: np.full_like(a, limit) for n, a in arrays.items() if n.endswith(".limit")}
+    return type(baseline)().restore({**arrays, **limits})
+
+
+@pytest.mark.parametrize("name", ["kalman_short", "kalman_long", "motion_filter"])
+def test_a_single_wild_value_moves_a_filter_little(name):
+    train, test = motion(0), motion(1)
+    fitted = fit_baseline(name, train)
+    assert all(bank.limited for bank in fitted.banks)
+    t = test[0]
+    row = int(np.flatnonzero(t.observed.all(axis=1))[20])
+    usual = fitted.predict(ob.Dataset((t,)))[0]
+    noise = np.sqrt(np.mean((usual - t.values)[5:][t.observed.all(axis=1)[5:]] ** 2, axis=0))
+    one = ob.Dataset((wild(t, row, 100 * noise),))
+    after = slice(row + 1, row + 12)
+    moved = np.abs(fitted.predict(one)[0] - usual)[after].max(axis=0)
+    free = np.abs(with_limits(fitted, 1e30).predict(one)[0] - usual)[after].max(axis=0)
+    assert (moved < 20 * noise).all()
+    assert (moved < 0.25 * free).all()
+
+
+def test_a_single_wild_value_moves_a_smoother_little():
+    train, test = motion(0), motion(1)
+    fitted = fit_baseline("smoother", train)
+    t = test[0]
+    row = int(np.flatnonzero(t.observed.all(axis=1))[20])
+    usual = fitted.predict(ob.Dataset((t,)))[0]
+    size = 100 * np.sqrt(np.mean(np.diff(t.values, axis=0) ** 2, axis=0))
+    one = ob.Dataset((wild(t, row, size),))
+    others = np.arange(t.rows) != row
+    moved = np.abs(fitted.predict(one)[0] - usual)[others].max(axis=0)
+    free = np.abs(with_limits(fitted, 1e30).predict(one)[0] - usual)[others].max(axis=0)
+    assert (moved < 0.25 * free).all()
+
+
+def test_a_step_is_followed_after_a_few_values():
+    train, test = motion(0), motion(1)
+    fitted = fit_baseline("kalman_short", train)
+    t = test[0]
+    values = t.values.copy()
+    size = 100 * np.sqrt(np.mean(np.diff(values, axis=0) ** 2, axis=0))
+    values[50:] += size
+    stepped = ob.Trajectory(t.times, values, observed=np.ones_like(t.observed))
+    missed = np.abs(fitted.predict(ob.Dataset((stepped,)))[0] - values)
+    assert (missed[58:] < 0.2 * size).all()
+
+
+def test_a_measurement_at_the_limit_is_that_of_a_filter_without_one():
+    chains = true_chains()
+    free = next(padded(motion(1)))
+    far = replace(chains, limit=np.full((2, len(chains.channels)), 1e6))
+    for exact, limited in zip(filtered(chains, free), filtered(far, free), strict=True):
+        assert np.array_equal(exact, limited)
+
+
+def test_beyond_the_limit_the_mean_moves_as_by_a_value_at_the_limit():
+    belief = Belief(
+        [np.zeros(1), np.zeros(1)],
+        {(0, 0): np.full(1, 3.0), (0, 1): np.ones(1), (1, 1): np.full(1, 2.0)},
+    )
+    there, noise = np.array([True]), np.ones(1)
+    at, _ = belief.updated(0, np.full(1, 2 * 2.5), noise, there)  # the deviation is 2
+    beyond, update = belief.updated(0, np.full(1, 1000.0), noise, there, np.full(1, 2.5))
+    assert update.beyond.all()
+    assert np.allclose(beyond.mean, at.mean)
+    assert beyond.cov[0, 0] > 0.99 * belief.cov[0, 0], "it says nothing about where the chain is"

@@ -28,6 +28,12 @@ from offbeat.baselines.simple import as_kind
 SERIES_BELOW = 0.3
 """Damping times gap up to which a power series is used: closed forms cancel there."""
 
+NO_LIMIT = 1e30
+"""Limit of innovations that limits nothing."""
+
+WIDER = 4.0
+"""Factor of the limit after each innovation in a row that was beyond it."""
+
 _TERMS = 14
 
 
@@ -131,7 +137,9 @@ class Belief(NamedTuple):
         cov = {(i, j): _row(f[j], j, half[i]) + step.noise[i, j] for i, j in step.noise}
         return Belief(mean, cov)
 
-    def updated(self, j: int, value: Any, noise: Any, mask: Any) -> tuple[Belief, Update]:
+    def updated(
+        self, j: int, value: Any, noise: Any, mask: Any, limit: Any = None
+    ) -> tuple[Belief, Update]:
         """After a measurement of state j; exact and symmetric for noise of any size, 0 included.
 
         Args:
@@ -139,14 +147,23 @@ class Belief(NamedTuple):
             value: (..., chains) measured.
             noise: (..., chains) its variance.
             mask: (..., chains) bool, where there is a measurement.
+            limit: (..., chains) of the innovation, in units of its standard deviation. Beyond it, a
+                measurement has so much more noise that it moves the mean as one at the limit would
+                (Huber 1964, Annals of Mathematical Statistics 35(1)).
         """
         xp = namespace(value)
         order = len(self.mean)
         column = [self.cov[min(i, j), max(i, j)] for i in range(order)]
         total = column[j] + noise
         total = xp.where(mask & (total > 0), total, 1.0)
-        gain = [xp.where(mask, c / total, 0.0) for c in column]
         surprise = xp.where(mask, value - self.mean[j], 0.0)
+        beyond = None
+        if limit is not None:
+            ratio = xp.abs(surprise) / (xp.sqrt(total) * limit)
+            beyond = ratio > 1.0
+            total = xp.where(beyond, total * ratio, total)
+            noise = xp.where(beyond, total - column[j], noise)
+        gain = [xp.where(mask, c / total, 0.0) for c in column]
         kept = xp.where(mask, noise / total, 1.0)
         mean = [m + g * surprise for m, g in zip(self.mean, gain, strict=True)]
         cov = {}
@@ -156,16 +173,20 @@ class Belief(NamedTuple):
             else:
                 left = p - gain[a] * column[b]
                 cov[a, b] = xp.where(left > 0, left, 0.0) if a == b else left
-        return Belief(mean, cov), Update(j, gain, surprise / total, mask)
+        return Belief(mean, cov), Update(j, gain, surprise / total, mask, beyond)
 
 
 class Update(NamedTuple):
-    """A measurement, as the smoother needs it: state, gain, innovation by its variance, mask."""
+    """A measurement, as the smoother needs it: state, gain, innovation by its variance, mask.
+
+    `beyond` says where the innovation was beyond its limit; None without one.
+    """
 
     state: int
     gain: list[Any]
     surprise: Any
     mask: Any
+    beyond: Any
 
 
 def _row(row: list[Any], i: int, vector: list[Any]) -> Any:
@@ -197,6 +218,9 @@ class Chains:
         prior_mean: (order, chains) of the states before the first observation.
         prior: (order, chains) their variance.
         variance: (chains,) unit of the variances.
+        limit: (order, chains) of the innovations of a state, in units of their standard deviation
+            before `variance`. After each measurement beyond it, the next one may be `WIDER` times
+            as far, so that a single wild value moves little and a step is soon followed.
     """
 
     channels: NDArray[np.int64]
@@ -211,11 +235,17 @@ class Chains:
     prior_mean: Array
     prior: Array
     variance: Array = field(default_factory=lambda: np.ones(1))
+    limit: Array = field(default_factory=lambda: np.full((1, 1), NO_LIMIT))
 
     @property
     def order(self) -> int:
         """Number of states of a chain."""
         return int(self.channels.shape[1])
+
+    @property
+    def limited(self) -> bool:
+        """Whether there is a limit of innovations."""
+        return bool((self.limit < NO_LIMIT).any())
 
     def arrays(self, prefix: str) -> dict[str, Array]:
         """All fields by name, after a prefix; `of` is the inverse."""
@@ -225,7 +255,9 @@ class Chains:
     def of(cls, arrays: Mapping[str, Array], prefix: str) -> Chains:
         """From what `arrays` returned."""
         fields: dict[str, Any] = {
-            n: np.asarray(arrays[prefix + n]) for n in cls.__dataclass_fields__
+            n: np.asarray(arrays[prefix + n])
+            for n in cls.__dataclass_fields__
+            if n != "limit" or prefix + n in arrays  # not in the first files of 0.2.0
         }
         return cls(**fields)
 
@@ -249,7 +281,8 @@ class Chains:
         """The state before the first row; see `CausalBaseline.start`."""
         empty = like[..., self._of(0)] * 0.0
         seen = {f"seen{i}": empty for i in range(self.order)}
-        return {**self._packed(self._before(empty)), "time": empty, "started": empty, **seen}
+        state = {**self._packed(self._before(empty)), "time": empty, "started": empty, **seen}
+        return {**state, **{f"beyond{i}": streak for i, streak in enumerate(self._streaks(empty))}}
 
     def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
         """The state after a row; see `CausalBaseline.observe`."""
@@ -292,7 +325,8 @@ class Chains:
         some = masks[0]
         for each in masks[1:]:
             some = some | each
-        belief, _ = self._measured(moved, values, masks)
+        streaks = [state[f"beyond{i}"] for i in range(self.order)] if self.limited else []
+        belief, _, streaks = self._measured(moved, values, masks, streaks)
         new = {
             name: xp.where(some, value, state[name]) for name, value in self._packed(belief).items()
         }
@@ -300,7 +334,7 @@ class Chains:
         new["started"] = xp.where(some, 1.0, state["started"])
         for i, each in enumerate(masks):
             new[f"seen{i}"] = xp.where(each, 1.0, state[f"seen{i}"])
-        return new
+        return {**new, **{f"beyond{i}": streak for i, streak in enumerate(streaks)}}
 
     # --- smoother ---------------------------------------------------------------------------------
 
@@ -320,7 +354,7 @@ class Chains:
         count = times.shape[1]
         gaps = np.diff(times, axis=1, prepend=times[:, :1])
         empty = np.zeros((len(rows.times), len(self.channels)))
-        belief = self._before(empty)
+        belief, streaks = self._before(empty), self._streaks(empty)
         steps: list[Transition] = []
         before: list[Belief] = []
         updates: list[list[Update]] = []
@@ -328,7 +362,7 @@ class Chains:
             steps.append(self._transition(gaps[:, i] + empty))
             before.append(belief.moved(steps[-1]))
             masks = self._masks(rows.observed[:, i])
-            belief, made = self._measured(before[-1], rows.values[:, i], masks)
+            belief, made, streaks = self._measured(before[-1], rows.values[:, i], masks, streaks)
             updates.append(made)
         adjoint: list[Any] = [0.0 * empty] * self.order
         means: list[list[Array]] = []
@@ -377,20 +411,33 @@ class Chains:
         damping, drive, walk = (self._like(a, gap) for a in (self.damping, self.drive, self.walk))
         return transition(gap, damping, drive, walk, self.order)
 
+    def _streaks(self, empty: Any) -> list[Any]:
+        """Per state, how many measurements in a row were beyond the limit; none without limits."""
+        return [empty for _ in range(self.order)] if self.limited else []
+
     def _measured(
-        self, belief: Belief, values: Any, masks: list[Any]
-    ) -> tuple[Belief, list[Update]]:
-        updates = []
+        self, belief: Belief, values: Any, masks: list[Any], streaks: list[Any]
+    ) -> tuple[Belief, list[Update], list[Any]]:
+        updates, after = [], list(streaks)
         for i, mask in enumerate(masks):
             if not (self.channels[:, i] >= 0).any():
                 continue
             value = values[..., self._of(i)]
+            xp = namespace(value)
             if i == 0:
                 value = value - self._like(self.offset, value)
             value = value / self._like(self.unit[:, i], value)
-            belief, update = belief.updated(i, value, self._like(self.noise[i], value), mask)
+            limit = None
+            if streaks:
+                limit = self._like(self.limit[i], value) * xp.exp(math.log(WIDER) * streaks[i])
+            noise = self._like(self.noise[i], value)
+            belief, update = belief.updated(i, value, noise, mask, limit)
             updates.append(update)
-        return belief, updates
+            if streaks:
+                longer = xp.clip(streaks[i] + 1.0, 0.0, 30.0)
+                streak = xp.where(update.beyond, longer, 0.0 * streaks[i])
+                after[i] = xp.where(mask, streak, streaks[i])
+        return belief, updates, after
 
     def _masks(self, mask: Any) -> list[Any]:
         xp = namespace(mask)

@@ -18,7 +18,7 @@ from offbeat.baselines.base import (
     namespace,
     padded,
 )
-from offbeat.baselines.kalman import Chains
+from offbeat.baselines.kalman import NO_LIMIT, Chains
 from offbeat.baselines.kalman_search import Sample, in_chunks, search
 from offbeat.data.trajectory import Dataset
 
@@ -35,6 +35,12 @@ _SPECIAL = np.array(
         [0.0, -9.0, -4.0, 0.0, 0.0],  # white acceleration, or jerk
     ]
 )
+
+LIMITS = (4.0, 8.0, 16.0, 32.0)
+"""Limits of innovations that are tried, in standard deviations."""
+
+FREE = 0.01
+"""Logarithm of the mean squared error that a limit of innovations may cost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +111,7 @@ class Wiring:
             prior_mean=self.prior_mean,
             prior=np.stack([prior[0], last] if order == 2 else prior),
             variance=np.ones(len(self.channels)),
+            limit=np.full((order, len(self.channels)), NO_LIMIT),
         )
 
 
@@ -123,7 +130,8 @@ def fit_chains(
 ) -> tuple[Chains, Array]:
     """Finds the parameters of chains.
 
-    The lowest mean over bins and channels of log(MSE / MSE of the reference) wins.
+    The lowest mean over bins and channels of log(MSE / MSE of the reference) wins. Then come the
+    tightest limits of innovations that cost next to nothing, so that one wild value moves little.
 
     Args:
         wiring: of the chains.
@@ -148,10 +156,62 @@ def fit_chains(
 
     count = sample.index.shape[1] + 2
     best = search(loss, _LOW[:count], _HIGH[:count], _SPECIAL[:, :count], len(measured), seed=1)
-    found = wiring.chains(best)
+    chains = local.chains(best)
+    chains = replace(chains, limit=_limits(chains, sample, spread))
+    found = replace(wiring.chains(best), limit=chains.limit)
     if not sample.two_sided:
-        found = replace(found, variance=_variance(local.chains(best), sample, weights))
-    return found, column_losses(best[None])[0]
+        found = replace(found, variance=_variance(chains, sample, weights))
+    return found, sample.loss(sample.errors(chains), weights, spread)[0].reshape(measured.shape)
+
+
+def _limits(chains: Chains, sample: Sample, spread: Array) -> Array:
+    """(order, chains) the tightest limits of innovations that cost next to nothing in every bin.
+
+    Args:
+        chains: without limits.
+        sample: of the same chains.
+        spread: (columns,) of the values.
+    """
+    usual = _usual_innovations(chains, sample)
+    floor = 1e-14 * spread**2 + 1e-300
+    counted = sample.weights() > 0.5
+    free = sample.errors(chains)[:, 0]
+    chosen = chains.limit.copy()
+    for times in LIMITS[::-1]:  # a tighter one replaces a wider one
+        limit = np.minimum(times * usual, NO_LIMIT)
+        errors = sample.errors(replace(chains, limit=limit))[:, 0]
+        cost = np.log((errors + floor) / (free + floor))
+        most = np.where(counted, cost, -np.inf).max(axis=0).reshape(sample.index.shape)
+        allowed = (most <= FREE) | (sample.index < 0)
+        chosen = np.where(allowed.all(axis=1), limit, chosen)
+    return np.asarray(chosen)
+
+
+def _usual_innovations(chains: Chains, sample: Sample) -> Array:
+    """(order, chains) standard deviation of the innovations, by their 90 % quantile.
+
+    In units of what the filter expects; `NO_LIMIT` where there are none.
+    """
+    rows = sample.rows
+    found: list[list[Array]] = [[] for _ in range(chains.order)]
+    state = chains.start(np.zeros((len(rows.times), rows.values.shape[2])))
+    for i in range(rows.times.shape[1]):
+        time, values, observed = rows.times[:, i], rows.values[:, i], rows.observed[:, i]
+        belief = chains.moved(state, time)
+        means = chains.in_units(belief.mean, [state[f"seen{j}"] for j in range(chains.order)])
+        for j in range(chains.order):
+            at = np.maximum(sample.index[:, j], 0)
+            missed = (values[:, at] - means[j]) / chains.unit[:, j]
+            ratio = np.abs(missed) / np.sqrt(belief.cov[j, j] + chains.noise[j])
+            counted = observed[:, at] & (sample.index[:, j] >= 0) & (state["started"] > 0)
+            found[j].append(np.where(counted, ratio, np.nan))
+        state = chains.committed(state, belief, time, values, observed)
+    result = np.full((chains.order, len(chains.channels)), NO_LIMIT)
+    for j, parts in enumerate(found):
+        every = np.concatenate(parts)
+        some = np.isfinite(every).any(axis=0)
+        result[j, some] = np.nanquantile(every[:, some], 0.9, axis=0) / 1.645
+    return np.where(result > 0, result, NO_LIMIT)
 
 
 def _variance(chains: Chains, sample: Sample, weights: Array) -> Array:

@@ -15,6 +15,9 @@ from offbeat.data.trajectory import Dataset
 FORGET = 0.08
 """Weight of the newest error in the running mean."""
 
+JUMP = 100.0
+"""Largest new error, as a multiple of the mean so far or of the usual one."""
+
 LARGEST = 1e4
 SMALLEST = 1e-6
 
@@ -75,7 +78,9 @@ class LocalScale:
         xp = namespace(values)
         predicted = self.slope.read(state, time)
         usual = self.usual_at(History.age(state, time))
-        error = xp.clip((values - predicted) ** 2 / usual, 0.0, LARGEST)
+        # A single wild value does not make the next hundred rows look like motion.
+        most = JUMP * xp.clip(state["square"], 1.0, LARGEST)
+        error = xp.minimum((values - predicted) ** 2 / usual, most)
         counted = mask & (state["count"] > 1)
         weight = xp.clip(1.0 / (state["seen"] + 2.0), FORGET, 1.0)
         square = state["square"] + weight * (error - state["square"])
