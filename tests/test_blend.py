@@ -13,6 +13,7 @@ from offbeat.answers.blend import fit_blend, tables_of
 from offbeat.answers.both_sides import Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
 from offbeat.baselines.history import AgeBins
+from offbeat.baselines.stack import kinds_of
 from offbeat.baselines.weights import (
     Errors,
     as_if_refitted,
@@ -278,6 +279,19 @@ def test_answers_stay_in_the_range_of_training_and_say_where_they_are_beyond(ble
 def test_bins_of_lengths_end_at_the_longest():
     edges = AgeBins.of_lengths(0.01, 0.12, 0.2).edges
     assert edges.tolist() == pytest.approx([0.0153, 0.0306, 0.0612, 0.2])
+
+
+def test_a_single_wild_value_does_not_look_like_motion_for_long(blend):
+    t = waves(3, 1)[0]
+    values = t.values.copy()
+    values[60] += 1000.0
+    keys, rows = blend.stack.keys, np.arange(200)
+    (usual,), (wild,) = (
+        kinds_of(keys, ob.Dataset((ob.Trajectory(t.times, v),))) for v in (t.values, values)
+    )
+    assert np.array_equal(wild[:61], usual[:61])
+    assert (wild[62, :, 1] > 5).all(), "it is seen"
+    assert (wild[rows > 110, :, 1] < 2 * usual[rows > 110, :, 1]).all()
 
 
 # --- with models ----------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from offbeat.data.trajectory import Dataset
 FORGET = 0.08
 """Weight of the newest error in the running mean."""
 
-JUMP = 100.0
+JUMP = 25.0
 """Largest new error, as a multiple of the mean so far or of the usual one."""
 
 LARGEST = 1e4
