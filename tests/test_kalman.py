@@ -12,6 +12,7 @@ import offbeat as ob
 from offbeat.baselines import fit_baseline
 from offbeat.baselines.base import Rows, padded
 from offbeat.baselines.kalman import Belief, Chains, filtered, transition
+from offbeat.baselines.kalman_search import Sample
 
 DAMPINGS = (0.0, 1e-3, 0.299, 0.301, 1.0, 3.0)
 GAPS = (1e-6, 1e-2, 0.5, 1.0, 4.0)
@@ -454,3 +455,21 @@ def test_beyond_the_limit_the_mean_moves_as_by_a_value_at_the_limit():
     assert update.beyond.all()
     assert np.allclose(beyond.mean, at.mean)
     assert beyond.cov[0, 0] > 0.99 * belief.cov[0, 0], "it says nothing about where the chain is"
+
+
+@pytest.mark.parametrize("two_sided", [False, True])
+def test_a_search_scores_what_filter_and_smoother_predict(two_sided):
+    tasks = motion(0)
+    index = np.arange(tasks.channels)[:, None] * [1, 0] + [0, -1]
+    sample = Sample.of(tasks, index, two_sided=two_sided)
+    own = replace(true_chains(), channels=sample.index)
+    found = sample.errors(own)
+    assert np.array_equal(sample.errors(own), found), "and again in the same memory"
+    means = own.smooth(sample.rows) if two_sided else filtered(own, sample.rows)
+    columns = [c * 2 for c in range(tasks.channels)]
+    errors = (means[0] - sample.rows.values[..., columns]) ** 2
+    for c, column in enumerate(columns):
+        total = np.nansum(found[:, 0, column] * sample.count[:, column])
+        chosen = sample.rows.known[..., column]
+        assert sample.count[:, column].sum() == chosen.sum() > 0
+        assert total == pytest.approx(errors[..., c][chosen].sum())

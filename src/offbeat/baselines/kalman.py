@@ -15,7 +15,7 @@ matrices.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -36,6 +36,9 @@ WIDER = 4.0
 
 _TERMS = 14
 
+_TINY = 1e-30
+"""Damping times gap of at least this, which divides."""
+
 
 def _series(p: int, q: int) -> list[float]:
     """Coefficients in z of the integral of u^(p+q) phi_p(-z u) phi_q(-z u) over u from 0 to 1."""
@@ -44,7 +47,7 @@ def _series(p: int, q: int) -> list[float]:
     return [float(c) / (m + p + q + 1) for m, c in enumerate(product)]
 
 
-_INTEGRALS = {(p, q): _series(p, q) for p in range(3) for q in range(p, 3)}
+_INTEGRALS = {pair: _series(*pair) for pair in ((0, 2), (1, 1), (2, 2))}
 _PHI_2 = [(-1.0) ** m / math.factorial(m + 2) for m in range(_TERMS)]
 
 
@@ -75,44 +78,43 @@ def transition(gap: Any, damping: Any, drive: Any, walk: Any, order: int) -> Tra
         order: number of states, 2 or 3.
     """
     xp = namespace(gap)
-    z = gap * damping
+    z = xp.clip(gap * damping, _TINY, None)
     small = z < SERIES_BELOW
     safe = xp.where(small, 1.0, z)
+    cube = safe * safe * safe
     e0, e1 = xp.exp(-z), -xp.expm1(-z)
-    e2 = xp.where(small, z * z * _polynomial(_PHI_2, z), z - e1)
-    # phi_p = E_p / z^p
-    phi_1 = xp.where(small, 1.0 - z * _polynomial(_PHI_2, z), e1 / safe)
-    reach = [e0, gap * phi_1]
-    half = 0.5 * (1.0 - e0 * e0)
-    exact = {
-        (0, 0): half,
-        (0, 1): 0.5 * e1 * e1,
-        (1, 1): z - 2.0 * e1 + half,
+    half = e1 * (1.0 - 0.5 * e1)  # (1 - E_0^2) / 2 without cancellation
+    reach = [e0, gap * (e1 / z)]  # gap^p E_p / z^p
+    squared = drive * gap * gap
+    integral = xp.where(small, _polynomial(_INTEGRALS[1, 1], z), (z - 2.0 * e1 + half) / cube)
+    # The derivative of the p-th reach is the one before: half its square is their integral.
+    last = drive * gap * (half / z)
+    beside = 0.5 * drive * reach[1] * reach[1]
+    second = squared * gap * integral
+    if order == 2:
+        matrix: list[list[Any]] = [[None, reach[1]], [None, e0]]
+        noise = {(0, 0): second + walk * gap, (0, 1): beside, (1, 1): last}
+        return Transition(matrix, noise)
+    e2 = z - e1
+    reach.append(gap * gap * xp.where(small, _polynomial(_PHI_2, z), e2 / (safe * safe)))
+    integral = xp.where(small, _polynomial(_INTEGRALS[0, 2], z), (half - z * e0) / cube)
+    across = squared * gap * integral
+    exact = ((z - 1.0) * (z - 1.0) * (z - 1.0) + 1.0) / 3.0 - 2.0 * z * e0 + half
+    integral = xp.where(small, _polynomial(_INTEGRALS[2, 2], z), exact / (cube * safe * safe))
+    noise = {
+        (0, 0): squared * gap * gap * gap * integral + walk * gap,
+        (0, 1): 0.5 * drive * reach[2] * reach[2],
+        (0, 2): across,
+        (1, 1): second,
+        (1, 2): beside,
+        (2, 2): last,
     }
-    if order == 3:
-        reach.append(gap * gap * xp.where(small, _polynomial(_PHI_2, z), e2 / (safe * safe)))
-        exact[0, 2] = half - z * e0
-        exact[1, 2] = 0.5 * e2 * e2
-        exact[2, 2] = ((z - 1.0) ** 3 + 1.0) / 3.0 - 2.0 * z * e0 + half
-    matrix: list[list[Any]] = [[None] * order for _ in range(order)]
-    noise: dict[tuple[int, int], Any] = {}
-    last = order - 1
-    for i in range(order):
-        matrix[i][last] = reach[last - i]
-        for j in range(i + 1, last):
-            matrix[i][j] = gap ** (j - i) / math.factorial(j - i)
-        for j in range(i, order):
-            q, p = last - i, last - j
-            power = p + q + 1
-            scaled = xp.where(small, _polynomial(_INTEGRALS[p, q], z), exact[p, q] / safe**power)
-            noise[i, j] = drive * gap**power * scaled
-    noise[0, 0] = noise[0, 0] + walk * gap
-    return Transition(matrix, noise)
+    return Transition([[None, gap, reach[2]], [None, None, reach[1]], [None, None, e0]], noise)
 
 
 def _polynomial(coefficients: list[float], z: Any) -> Any:
-    result = coefficients[-1] + 0.0 * z
-    for c in reversed(coefficients[:-1]):
+    result = coefficients[-1] * z + coefficients[-2]
+    for c in reversed(coefficients[:-2]):
         result = result * z + c
     return result
 
@@ -153,18 +155,21 @@ class Belief(NamedTuple):
         """
         xp = namespace(value)
         order = len(self.mean)
+        measured = xp.where(mask, 1.0, 0.0)
+        value = xp.where(mask, value, 0.0)
         column = [self.cov[min(i, j), max(i, j)] for i in range(order)]
         total = column[j] + noise
-        total = xp.where(mask & (total > 0), total, 1.0)
-        surprise = xp.where(mask, value - self.mean[j], 0.0)
+        total = xp.where(total > 0, total, 1.0)
+        surprise = value - measured * self.mean[j]
         beyond = None
         if limit is not None:
             ratio = xp.abs(surprise) / (xp.sqrt(total) * limit)
             beyond = ratio > 1.0
             total = xp.where(beyond, total * ratio, total)
             noise = xp.where(beyond, total - column[j], noise)
-        gain = [xp.where(mask, c / total, 0.0) for c in column]
-        kept = xp.where(mask, noise / total, 1.0)
+        inverse = measured / total
+        gain = [c * inverse for c in column]
+        kept = noise * inverse + (1.0 - measured)
         mean = [m + g * surprise for m, g in zip(self.mean, gain, strict=True)]
         cov = {}
         for (a, b), p in self.cov.items():
@@ -172,20 +177,20 @@ class Belief(NamedTuple):
                 cov[a, b] = p * kept
             else:
                 left = p - gain[a] * column[b]
-                cov[a, b] = xp.where(left > 0, left, 0.0) if a == b else left
-        return Belief(mean, cov), Update(j, gain, surprise / total, mask, beyond)
+                cov[a, b] = xp.clip(left, 0.0, None) if a == b else left
+        return Belief(mean, cov), Update(j, gain, surprise * inverse, beyond)
 
 
 class Update(NamedTuple):
-    """A measurement, as the smoother needs it: state, gain, innovation by its variance, mask.
+    """A measurement, as the smoother needs it: state, gain, innovation by its variance.
 
-    `beyond` says where the innovation was beyond its limit; None without one.
+    Where nothing was measured, gain and innovation are 0. `beyond` says where the innovation was
+    beyond its limit; None without one.
     """
 
     state: int
     gain: list[Any]
     surprise: Any
-    mask: Any
     beyond: Any
 
 
@@ -195,6 +200,46 @@ def _row(row: list[Any], i: int, vector: list[Any]) -> Any:
     for j in range(i + 1, len(vector)):
         result = result + row[j] * vector[j]
     return result
+
+
+class Memory:
+    """Arrays of all rows, in memory that the next call uses again.
+
+    A search calls a filter or a smoother many times with arrays of the same size; half of its time
+    would go into new memory. What a call returns is overwritten by the next one.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[int, ...], Array] = {}
+
+    def keeper(self, row: int, shape: tuple[int, ...]) -> Callable[[Array], Array]:
+        """A function that copies arrays of a row, each to a place of its own.
+
+        Args:
+            row: number of the row.
+            shape: (rows, ...) of an array of all rows.
+        """
+        count = iter(range(1000))
+
+        def keep(array: Array) -> Array:
+            place = (next(count), *shape)
+            if place not in self._arrays:
+                self._arrays[place] = np.empty(shape)
+            kept: Array = self._arrays[place][row]
+            kept[...] = array
+            return kept
+
+        return keep
+
+    def means(self, order: int, shape: tuple[int, ...], rows: int) -> list[Array]:
+        """(..., rows, chains) per state, not initialised."""
+        found = []
+        for j in range(order):
+            place = (-1 - j, rows, *shape)
+            if place not in self._arrays:
+                self._arrays[place] = np.empty((*shape[:-1], rows, shape[-1]))
+            found.append(self._arrays[place])
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,37 +396,101 @@ class Chains:
             (..., batch, rows, chains) per state, in units of the channels.
         """
         times = _times(rows)
-        count = times.shape[1]
-        gaps = np.diff(times, axis=1, prepend=times[:, :1])
-        empty = np.zeros((len(rows.times), len(self.channels)))
-        belief, streaks = self._before(empty), self._streaks(empty)
-        steps: list[Transition] = []
-        before: list[Belief] = []
-        updates: list[list[Update]] = []
-        for i in range(count):
-            steps.append(self._transition(gaps[:, i] + empty))
-            before.append(belief.moved(steps[-1]))
-            masks = self._masks(rows.observed[:, i])
-            belief, made, streaks = self._measured(before[-1], rows.values[:, i], masks, streaks)
-            updates.append(made)
-        adjoint: list[Any] = [0.0 * empty] * self.order
-        means: list[list[Array]] = []
-        for i in range(count - 1, -1, -1):
-            for update in reversed(updates[i]):
-                j = update.state
-                fed = sum(g * a for g, a in zip(update.gain, adjoint, strict=True))
-                adjoint[j] = adjoint[j] - np.where(update.mask, fed + update.surprise, 0.0)
-            cov = before[i].cov
-            means.append(
-                [
-                    m - sum(cov[min(a, b), max(a, b)] * adjoint[b] for b in range(self.order))
-                    for a, m in enumerate(before[i].mean)
-                ]
-            )
-            adjoint = _transposed(steps[i].matrix, adjoint)
-        stacked = [np.stack([m[a] for m in reversed(means)], axis=-2) for a in range(self.order)]
+        means = self.smoothed(rows, np.diff(times, axis=1, prepend=times[:, :1]))
         seen = [m.any(axis=1)[:, None] * 1.0 for m in self._masks(rows.observed)]
-        return self.in_units(stacked, seen)
+        return self.in_units(means, seen)
+
+    def smoothed(self, rows: Rows, gaps: Array, memory: Memory | None = None) -> list[Array]:
+        """As `smooth`, in the units of the states.
+
+        Args:
+            rows: of equal channels.
+            gaps: (batch, rows, 1 or chains) s since the row before.
+            memory: for the result and for what is kept on the way; see `Memory`.
+        """
+        memory = memory or Memory()
+        kept: list[tuple[list[list[Any]], Belief, list[Update]]] = []
+        for matrix, before, updates in self.forward(rows, gaps):
+            shape = (gaps.shape[1], *before.mean[0].shape)
+            keep = memory.keeper(len(kept), shape)
+            kept.append(
+                (
+                    [[None if each is None else keep(each) for each in row] for row in matrix],
+                    Belief(
+                        [keep(m) for m in before.mean],
+                        {pair: keep(p) for pair, p in before.cov.items()},
+                    ),
+                    [
+                        Update(u.state, [keep(g) for g in u.gain], keep(u.surprise), None)
+                        for u in updates
+                    ],
+                )
+            )
+        adjoint: list[Any] = [0.0 * m for m in kept[0][1].mean]
+        means = memory.means(self.order, adjoint[0].shape, gaps.shape[1])
+        for i in range(len(kept) - 1, -1, -1):
+            matrix, before, updates = kept.pop()
+            for update in reversed(updates):
+                j = update.state
+                fed = update.surprise
+                for g, a in zip(update.gain, adjoint, strict=True):
+                    fed = fed + g * a
+                adjoint[j] = adjoint[j] - fed
+            cov = before.cov
+            for a, m in enumerate(before.mean):
+                moved = m - cov[0, a] * adjoint[0]
+                for b in range(1, self.order):
+                    moved -= cov[min(a, b), max(a, b)] * adjoint[b]
+                means[a][..., i, :] = moved
+            adjoint = _transposed(matrix, adjoint)
+        return means
+
+    def forward(
+        self, rows: Rows, gaps: Array
+    ) -> Iterator[tuple[list[list[Any]], Belief, list[Update]]]:
+        """The matrix of the step to every row, the belief before its measurements, and these.
+
+        Args:
+            rows: of equal channels.
+            gaps: (batch, rows, 1 or chains) s since the row before.
+        """
+        empty = np.zeros((len(rows.times), len(self.channels)))
+        masks = self._masks(rows.observed)
+        belief, streaks = self._before(empty), self._streaks(empty)
+        for i in range(gaps.shape[1]):
+            step = self._transition(gaps[:, i] + empty)
+            before = belief.moved(step)
+            at = [m[:, i] for m in masks]
+            belief, made, streaks = self._measured(before, rows.values[:, i], at, streaks)
+            yield step.matrix, before, made
+
+    # --- filter, all rows at once -----------------------------------------------------------------
+
+    def seen_before(self, rows: Rows) -> list[Array]:
+        """(batch, rows, chains) per state: 1 where its channel was observed in an earlier row."""
+        found = []
+        for mask in self._masks(rows.observed):
+            before = np.zeros(mask.shape)
+            before[:, 1:] = np.logical_or.accumulate(mask, axis=1)[:, :-1]
+            found.append(before)
+        return found
+
+    def predicted(self, rows: Rows, gaps: Array, memory: Memory | None = None) -> list[Array]:
+        """(..., batch, rows, chains) per state: its mean before every row, in units of the states.
+
+        Args:
+            rows: of equal channels.
+            gaps: of `gaps_of`.
+            memory: for the result; see `Memory`.
+        """
+        memory = memory or Memory()
+        means: list[Array] = []
+        for i, (_, before, _) in enumerate(self.forward(rows, gaps)):
+            if not means:
+                means = memory.means(self.order, before.mean[0].shape, gaps.shape[1])
+            for stacked, mean in zip(means, before.mean, strict=True):
+                stacked[..., i, :] = mean
+        return means
 
     # --- what both share --------------------------------------------------------------------------
 
@@ -467,15 +576,21 @@ class Chains:
 
 def filtered(chains: Chains, rows: Rows) -> list[Array]:
     """What a filter predicts for every row: (..., batch, rows, chains) per state."""
+    seen = chains.seen_before(rows)
+    means = chains.predicted(rows, gaps_of(rows, seen))
+    return chains.in_units(means, seen)
+
+
+def gaps_of(rows: Rows, seen: Sequence[Array]) -> Array:
+    """(batch, rows, chains) s since the row before, from the first observation of a chain on.
+
+    Args:
+        rows: to step through.
+        seen: of `Chains.seen_before`.
+    """
     times = _times(rows)
-    state = chains.start(np.zeros((rows.values.shape[0], rows.values.shape[2])))
-    reads = []
-    for i in range(times.shape[1]):
-        moved = chains.moved(state, times[:, i])
-        seen = [state[f"seen{j}"] for j in range(chains.order)]
-        reads.append(chains.in_units(moved.mean, seen))
-        state = chains.committed(state, moved, times[:, i], rows.values[:, i], rows.observed[:, i])
-    return [np.stack([r[j] for r in reads], axis=-2) for j in range(chains.order)]
+    started = np.maximum.reduce(list(seen)) > 0
+    return np.where(started, np.diff(times, axis=1, prepend=times[:, :1]), 0.0)
 
 
 def _times(rows: Rows) -> Array:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.baselines.base import Array, Rows
 from offbeat.baselines.history import AgeBins
-from offbeat.baselines.kalman import Chains, filtered
+from offbeat.baselines.kalman import Chains, Memory
 from offbeat.data.trajectory import Dataset, Trajectory
 
 CANDIDATES = 120
@@ -34,8 +34,88 @@ FEW = 20
 _AT_ONCE = 20_000
 """Candidates times segments times chains that are stepped through together."""
 
+_KEPT = np.zeros(1_000_000, dtype=bool)
+_KEPT[[round(1.4**k) for k in range(40)]] = True
+
 _Segment = tuple[Trajectory, NDArray[np.int64]]
 """A trajectory and some of its rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Values that are scored, by state, then by chain, then by bin.
+
+    Attributes:
+        place: (scored,) of the values in an array (segments, rows, columns), flattened.
+        starts: (groups,) number of the first value of each column and bin that has any.
+        column: (groups,) its column.
+        bin: (groups,) its bin.
+        ends: (order + 1,) number of the first value of each state, and of all values.
+        count: (bins, columns) values.
+    """
+
+    place: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    column: NDArray[np.int64]
+    bin: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    count: Array
+
+    @classmethod
+    def of(
+        cls, kind: NDArray[np.int64], scored: NDArray[np.bool_], bins: int, order: int
+    ) -> Scored:
+        """The values of an array that are scored.
+
+        Args:
+            kind: (segments, rows, columns) bin of each.
+            scored: (segments, rows, columns).
+            bins: their number.
+            order: states of a chain.
+        """
+        place = np.flatnonzero(scored)
+        columns = scored.shape[2]
+        column, kinds = place % columns, kind.reshape(-1)[place]
+        sorting = np.lexsort((kinds, column // order, column % order))
+        place, column, kinds = place[sorting], column[sorting], kinds[sorting]
+        new = np.ones(len(place), dtype=bool)
+        new[1:] = (np.diff(column) != 0) | (np.diff(kinds) != 0)
+        starts = np.flatnonzero(new)
+        count = np.zeros((bins, columns))
+        np.add.at(count, (kinds, column), 1.0)
+        ends = np.searchsorted(column % order, np.arange(order + 1))
+        return cls(place, starts, column[starts], kinds[starts], ends, count)
+
+    def of_state(
+        self, j: int, chains: int, order: int
+    ) -> tuple[slice, NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers of the values of a state, their place in (segments, rows, chains), their chain.
+
+        Args:
+            j: number of the state.
+            chains: their number.
+            order: states of a chain.
+        """
+        own = slice(int(self.ends[j]), int(self.ends[j + 1]))
+        row, column = np.divmod(self.place[own], chains * order)
+        chain = column // order
+        return own, row * chains + chain, chain
+
+    def means(self, squares: Array) -> Array:
+        """Means over the scored values of each bin.
+
+        Args:
+            squares: (candidates, scored).
+
+        Returns:
+            (bins, candidates, columns).
+        """
+        found = np.zeros((*self.count.shape, len(squares)))
+        if len(self.starts):
+            total = np.add.reduceat(squares, self.starts, axis=1)
+            found[self.bin, self.column] = total.T
+        mean: Array = found / np.maximum(self.count, 1)[..., None]
+        return mean.swapaxes(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,20 +127,24 @@ class Sample:
             is order * c + j.
         index: (chains, order) those numbers, -1 where no channel measures a state.
         bins: of the time since observation.
-        hot: (columns, segments * rows, bins) 1 where a value is scored, in its bin.
+        scored: the values that are scored.
+        gaps: (segments, rows, chains) s since the row before, as the filter or smoother needs it.
         count: (bins, columns) scored values.
         reference: (bins, columns) mean squared error of the last value, or of a straight line.
         two_sided: whether masked values are scored, given all others; else all values are that
             follow an observation of their channel, given what was observed before.
+        memory: that all calls of `errors` use.
     """
 
     rows: Rows
     index: NDArray[np.int64]
     bins: AgeBins
-    hot: Array
+    scored: Scored
+    gaps: Array
     count: Array
     reference: Array
     two_sided: bool
+    memory: Memory = field(default_factory=Memory)
 
     @classmethod
     def of(
@@ -91,7 +175,7 @@ class Sample:
                 for j in np.flatnonzero(channels[c] >= 0):
                     k = c * order + j
                     y, seen = t.values[at, channels[c, j]], t.observed[at, channels[c, j]]
-                    known = t.known[at, channels[c, j]]
+                    known = ~np.isnan(y)
                     values[s, :n, k] = np.where(known, y, 0.0)
                     observed[s, :n, k] = seen
                     age[s, :n, k], last = _since(times[s, :n, c], y, seen)
@@ -102,15 +186,20 @@ class Sample:
         if two_sided:
             scored &= ~observed
         bins = AgeBins.of(tasks)
-        hot = (bins.of_age(age)[..., None] == np.arange(len(bins))) & scored[..., None]
-        hot = np.moveaxis(hot.astype(np.float64), 2, 0).reshape(columns, -1, len(bins))
         index = np.where(channels >= 0, np.arange(columns).reshape(chains, order), -1)
+        found = Scored.of(bins.of_age(age), scored, len(bins), order)
+        gaps = np.diff(times, axis=1, prepend=times[:, :1])
+        if not two_sided:
+            some = np.asarray(observed.reshape(count, rows, chains, order).any(axis=3))
+            started = np.logical_or.accumulate(some, axis=1)
+            gaps[:, 1:] *= started[:, :-1]
         made = cls(
             Rows(times, values, observed, scored, (rows,) * count),
             index,
             bins,
-            hot,
-            hot.sum(axis=1).T,
+            found,
+            gaps,
+            found.count,
             np.zeros((len(bins), columns)),
             two_sided,
         )
@@ -126,19 +215,24 @@ class Sample:
         Returns:
             (bins, candidates, columns).
         """
-        flat = np.moveaxis(squares, -1, 0).reshape(squares.shape[-1], len(squares), -1)
-        total = np.moveaxis(flat @ self.hot, -1, 0)
-        mean: Array = total / np.maximum(self.count, 1)[..., None]
-        return mean.swapaxes(1, 2)
+        return self.scored.means(squares.reshape(len(squares), -1)[:, self.scored.place])
 
     def errors(self, chains: Chains) -> Array:
         """Mean squared errors of what chains predict: (bins, candidates, columns)."""
-        predict = Chains.smooth if self.two_sided else filtered
-        means = predict(chains, self.rows)
-        predicted = np.stack(means, axis=-1).reshape(*means[0].shape[:-1], -1)
-        if predicted.ndim == 3:
-            predicted = predicted[None]
-        return self.binned((predicted - self.rows.values) ** 2)
+        predict = chains.smoothed if self.two_sided else chains.predicted
+        means = predict(self.rows, self.gaps, self.memory)
+        if means[0].ndim == 3:
+            means = [m[None] for m in means]
+        squares = np.empty((len(means[0]), len(self.scored.place)))
+        truth = self.rows.values.reshape(-1)[self.scored.place]
+        for j, mean in enumerate(means):
+            own, place, chain = self.scored.of_state(j, *self.index.shape)
+            unit, offset = chains.unit[chain, j], chains.offset[chain] if j == 0 else 0.0
+            missed = mean.reshape(len(mean), -1)[:, place]
+            missed *= unit
+            missed += offset - truth[own]
+            np.square(missed, out=squares[:, own])
+        return self.scored.means(squares)
 
     def halves(self) -> tuple[Array, Array]:
         """(bins, columns) weights of the bins of short and of long times since observation.
@@ -190,7 +284,7 @@ def _segments(tasks: Dataset, channels: NDArray[np.int64], most: int) -> list[_S
         # From the end: that is where forecasts are.
         for stop in range(len(at), 0, -SEGMENT):
             rows = at[max(stop - SEGMENT, 0) : stop]
-            seen = t.observed[np.ix_(rows, channels)]
+            seen = t.observed[rows[:, None], channels]
             if len(rows) >= 3 and seen.any():
                 (logged if seen.all() else masked).append((t, rows))
     chosen = [_evenly(masked, most)]
@@ -207,12 +301,11 @@ def _evenly(every: Sequence[_Segment], most: int) -> list[_Segment]:
 
 def _thinned(t: Trajectory, channels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows in which one of the channels is known; in long outages, ever fewer of them."""
-    at = np.flatnonzero(t.known[:, channels].any(axis=1))
-    seen = t.observed[np.ix_(at, channels)].any(axis=1)
+    at = np.flatnonzero(~np.isnan(t.values[:, channels]).all(axis=1))
+    seen = np.asarray(t.observed[:, channels].any(axis=1))[at]
     place = np.arange(len(at))
-    since = place - np.maximum.accumulate(np.where(seen, place, -1))
-    kept = np.unique(np.rint(1.4 ** np.arange(40)).astype(int))
-    return np.asarray(at[seen | np.isin(since, kept)])
+    since = np.minimum(place - np.maximum.accumulate(np.where(seen, place, -1)), len(_KEPT) - 1)
+    return np.asarray(at[seen | _KEPT[since]])
 
 
 def _since(times: Array, values: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array]:
