@@ -14,7 +14,7 @@ import torch
 from model_helpers import draw_weights, small_model, trajectory
 from stream_helpers import message
 from task_helpers import TASKS, TRAIN, VALIDATION
-from test_contract import FLOAT32, FLOAT64, TOLERANCE, VARIANTS, build, dtypes
+from test_contract import FLOAT32, FLOAT64, TOLERANCE, VARIANTS, ZOO, build, dtypes
 from torch import Tensor
 
 from offbeat import (
@@ -34,7 +34,7 @@ from offbeat.data.tasks import draw_tasks
 from offbeat.export.exporter import StreamStep, _traceable
 from offbeat.export.runner import STATE
 from offbeat.models.corrected import CorrectedModel
-from offbeat.models.zoo import ZOO, make_model
+from offbeat.models.zoo import make_model
 
 FIXED = [
     name
@@ -144,7 +144,8 @@ def test_an_exported_model_of_double_precision_keeps_it(exported: Any) -> None:
 @pytest.mark.parametrize(
     ("base", "name"),
     [
-        ("damped_slope", "anchored_ode_gru_d"),
+        ("damped_slope", "anchored_trend"),
+        pytest.param("damped_slope", "anchored_ode_gru_d", marks=pytest.mark.slow),
         pytest.param("kalman_short", "ode_gru_d", marks=pytest.mark.slow),
     ],
 )

@@ -14,7 +14,7 @@ import pytest
 import torch
 from model_helpers import dataset, small_model, trajectory, with_observed
 from stream_helpers import Recorded, batch_predictions, message
-from test_contract import FLOAT32, TOLERANCE, VARIANTS, build, dtypes, variants
+from test_contract import FLOAT32, TOLERANCE, VARIANTS, ZOO, build, dtypes, variants
 
 from offbeat import (
     Dataset,
@@ -26,7 +26,6 @@ from offbeat import (
     kernels,
     predict,
 )
-from offbeat.models.zoo import ZOO
 
 some = pytest.mark.parametrize(
     "variant", [*ZOO, *(name for name in VARIANTS if name.startswith("thesis"))]

@@ -361,7 +361,7 @@ def test_a_requested_time_changes_no_other_prediction_of_a_corrected_baseline():
     assert not np.allclose(many[0], many[1])
 
 
-@pytest.mark.parametrize("name", ["gru", "ode_gru_d", "anchored_ode_gru_d"])
+@pytest.mark.parametrize("name", ["gru", "ode_gru_d", "anchored_ode_gru_d", "anchored_trend"])
 @pytest.mark.parametrize("base", ["damped_slope", "kalman_short"])
 def test_a_stream_predicts_what_the_batch_does(base, name):
     model = corrected(base, name=name)

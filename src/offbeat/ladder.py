@@ -60,16 +60,15 @@ class Candidate:
         return f"{self.model.name}{base}-{self.model.hidden_size}-{self.learning_rate:g}"
 
 
-def _gated(hidden: int, units: int, rate: float) -> Candidate:
-    config = ModelConfig("anchored_ode_gru_d", hidden_size=hidden, field_units=(units, units))
-    return Candidate(config, rate, "damped_slope")
+def _anchored(name: str, rate: float, corrects: str | None = "damped_slope") -> Candidate:
+    return Candidate(ModelConfig(name, hidden_size=32, field_units=(64, 64)), rate, corrects)
 
 
 CANDIDATES = (
-    _gated(32, 64, 0.006),
-    _gated(16, 32, 0.006),
-    _gated(32, 64, 0.002),
-    _gated(64, 64, 0.004),
+    _anchored("anchored_trend", 0.006),
+    _anchored("anchored_ode_gru_d", 0.006),
+    _anchored("anchored_trend", 0.006, None),
+    _anchored("anchored_ode_gru_d", 0.002),
 )
 """Candidates in the order in which they are tried; where the budget is short, the first ones."""
 
@@ -220,7 +219,9 @@ class _Ladder:
 
     def made(self, candidate: Candidate) -> BaseModel:
         """An untrained model."""
-        found: Model = make_model(candidate.model, self.train, scaler=self.scaler, seed=self.seed)
+        found: Model = make_model(
+            candidate.model, self.train, scaler=self.scaler, seed=self.seed, tasks=self.tasks
+        )
         if candidate.corrects is None:
             return found
         kind = BASELINES[candidate.corrects]

@@ -35,8 +35,13 @@ HORIZON = 16
 FURTHEST = 10.0
 """A slope carries a level at most as far as it does in this many of the longest times tuned for."""
 
-CELLS = 30_000
+CELLS = 15_000
 """Most rows of all channels together that a search steps through."""
+
+KEPT = 8
+"""Data sets whose filters are kept: models of several sizes or seeds are made for the same data."""
+
+_tuned: dict[str, tuple[tuple[float, float, float, float], ...]] = {}
 
 LOOSE = 1e8
 """Variance of a level before its first observation."""
@@ -60,6 +65,15 @@ def tune_filters(train: Dataset) -> tuple[tuple[float, float, float, float], ...
         tasks = draw_tasks(train, window, TASKS)
     if len(tasks) > TASKS:
         tasks = tasks.take(np.linspace(0, len(tasks) - 1, TASKS).round().astype(np.int64))
+    key = tasks.fingerprint()
+    if key not in _tuned:
+        while len(_tuned) >= KEPT:
+            _tuned.pop(next(iter(_tuned)))
+        _tuned[key] = _tune(tasks)
+    return _tuned[key]
+
+
+def _tune(tasks: Dataset) -> tuple[tuple[float, float, float, float], ...]:
     channels = [[c, -1] for c in range(tasks.channels)]
     sample = Sample.of(tasks, np.array(channels), two_sided=False, cells=CELLS)
     mean, scale = moments(tasks)

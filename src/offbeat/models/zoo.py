@@ -294,6 +294,7 @@ def make_model(
     *,
     scaler: ScalerKind | Scaler = "standardise",
     seed: int = 0,
+    tasks: Dataset | None = None,
     **options: Any,
 ) -> Any:
     """Makes an untrained model for the channels, scales and gaps of a training set.
@@ -303,6 +304,8 @@ def make_model(
         train: the training set; means, scales and gaps are measured on its observed values.
         scaler: a kind, fitted on `train`, or a scaler fitted elsewhere.
         seed: of the initial weights.
+        tasks: that the filters of a model with a trend are tuned on; by default the training set,
+            or tasks that are drawn from it where nothing in it is masked.
         **options: fields of `ModelConfig` that replace the entry's; for a registered module,
             the arguments of its factory.
 
@@ -326,7 +329,7 @@ def make_model(
         one_of("model option", key, [f.name for f in fields(config)])
     config, info = resolve(replace(config, **options)), _info(train, scaler)
     if config.trend:
-        filters = tune_filters(train)
+        filters = tune_filters(train if tasks is None else tasks)
         info = replace(info, statistics=replace(info.statistics, filters=filters))
     return Model(config, info, seed=seed)
 
