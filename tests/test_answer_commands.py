@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.cli.common import answer_columns, plain
 from offbeat.plots.answers import answers
+from offbeat.plots.figures import channel_panels
 
 NAMES = ("gyro", "tilt", "height")
 PARTS = [
@@ -312,3 +314,17 @@ def test_the_lasa_example_runs_from_demonstrations_to_scores(tmp_path, capsys):
     capsys.readouterr()
     assert main(["evaluate", str(out), str(data), "--horizons=0.1"]) == 0
     assert "forecast, 0.1 s: " in capsys.readouterr().out
+
+
+def test_a_legend_names_what_any_panel_shows_each_once() -> None:
+    """The first channel may lack what others have, such as intervals or values beyond training."""
+    one = ob.Trajectory([0.0, 1.0], [[1.0, 2.0], [2.0, 1.0]], names=("x", "y"))
+
+    def draw(axes: Any, truth: ob.Trajectory, predicted: Any, name: str) -> None:
+        axes.plot(truth.times, truth.values[:, 0], label="True")
+        if name == "y":
+            axes.plot(truth.times, truth.values[:, 1], label="Beyond training")
+
+    figure = channel_panels(draw, one, {}, ["x", "y"], title="", height=1.0)
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["True", "Beyond training"]

@@ -253,6 +253,50 @@ def test_a_batch_of_no_trajectories_is_refused() -> None:
         run({}, "baseline", batch=0)
 
 
+def broadcast(*shape: int, kind: type = np.float32) -> NDArray[Any]:
+    """Ones of any shape in the memory of one."""
+    return np.broadcast_to(np.ones(1, kind), shape)
+
+
+@pytest.mark.parametrize("rows", [2**31, 2**32, 2**32 + 3, 2**40])
+def test_more_rows_than_32_bits_count_are_refused(rows: int) -> None:
+    changes = {"gap": broadcast(2, rows), "update": broadcast(2, rows),
+               "values": broadcast(2, rows, 2), "mask": broadcast(2, rows, 2)}  # fmt: skip
+    with pytest.raises(ob.InputError, match=f"number of rows is {rows}, expected 1 to 2147483647"):
+        run({}, "baseline", changes=changes)
+
+
+@pytest.mark.parametrize("batch", [2**31, 2**32, 2**32 + 2])
+def test_more_trajectories_than_32_bits_count_are_refused(batch: int) -> None:
+    """A state of that many would need memory, so it is one row of them, which is refused, too."""
+    inputs = compiled.StepInputs_f32(**{
+        **dict.fromkeys((*QUANTITIES, "mean", "use_prediction", "length")),
+        "gap": broadcast(batch, 3), "update": broadcast(batch, 3),
+        "values": broadcast(batch, 3, 2), "mask": broadcast(batch, 3, 2),
+    })  # fmt: skip
+    for state in (broadcast(batch, 3), np.ones((2, 3), np.float32)):
+        with pytest.raises(ob.InputError, match=r"has stride 0|has shape"):
+            compiled.tape_size(make_spec(), "baseline", inputs, state)
+
+
+@every_set
+def test_a_tape_of_more_numbers_than_32_bits_count_is_measured_and_not_made(name: str) -> None:
+    """Its size is known in 64 bits; an array of another size is refused before it is touched."""
+    rows, ones = 2**18, np.ones((1, 2**18, 2), np.float32)
+    spec = make_spec(units=(10_000,), steps=1000)
+    inputs = compiled.StepInputs_f32(**{
+        **dict.fromkeys((*QUANTITIES, "mean", "use_prediction", "length")),
+        "gap": ones[:, :, 0].copy(), "update": ones[:, :, 0].copy(), "values": ones, "mask": ones,
+    })  # fmt: skip
+    state = np.ones((1, 3), np.float32)
+    size = compiled.tape_size(spec, name, inputs, state)
+    assert size > rows * 10_000 > 2**31
+    with pytest.raises(ob.InputError, match="has shape"):
+        compiled.scan_forward(spec, name, np.zeros(spec.flat_size, np.float32), inputs, state,
+                              np.empty((1, 2, 3), np.float32), np.empty((1, 2, 3), np.float32),
+                              None, 1)  # fmt: skip
+
+
 @pytest.mark.parametrize("size", [0, 1, 80, 10**6])
 def test_weights_of_the_wrong_size_are_refused(size: int) -> None:
     with pytest.raises(ob.InputError, match="weights has shape"):
@@ -292,6 +336,35 @@ def test_models_and_streams_refuse_more_steps_than_there_can_be(
         stream()
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_model_of_weights_that_are_not_finite_ends_in_one_line(value: float) -> None:
+    import torch
+
+    times = np.arange(5) / 10
+    data = ob.Dataset((ob.Trajectory(times, np.sin(times)[:, None] * [1.0, 2.0]),))
+    model = ob.make_model("ode_rnn", data)
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.fill_(value)
+    with pytest.raises(ob.OffbeatError, match="finite"):
+        ob.Stream(model).predict(0.0)
+    with pytest.raises(ob.DivergenceError, match="the loss is nan in epoch 1, step 1"):
+        ob.fit(model, data, config=ob.TrainConfig(epochs=1), progress=False)
+
+
+@pytest.mark.parametrize("time", [math.inf, -math.inf, math.nan, 1e308])
+def test_times_that_are_not_finite_never_reach_the_module(time: float) -> None:
+    values = np.ones((3, 1))
+    if not math.isfinite(time):
+        with pytest.raises(ob.InputError, match="finite"):
+            ob.Trajectory([0.0, 1.0, time], values)
+        return
+    far = ob.Dataset((ob.Trajectory([0.0, 1.0, time], values),))
+    model = ob.make_model("ode_rnn", far)
+    with pytest.raises(ob.InputError, match="decay_span is inf, expected a finite number"):
+        ob.predict(model, far)
+
+
 # --- shapes and values that compute ---------------------------------------------------------------
 
 SHAPES: dict[str, tuple[dict[str, Any], int, int]] = {
@@ -299,6 +372,8 @@ SHAPES: dict[str, tuple[dict[str, Any], int, int]] = {
                         "input_decay": True, "units": (5,)}, 3, 2),
     "1,000 anchored channels": ({"channels": 1000, "anchored": 1000, "units": (9,)}, 2, 2),
     "20,000 rows": ({}, 2, 20_000),
+    "20,000 rows of 1,000 channels": ({"channels": 1000, "units": (2,)}, 1, 20_000),
+    "more trajectories than lanes": ({"units": (2,)}, 4099, 2),
     "one hidden unit": ({"hidden": 1, "units": (1,), "channels": 1}, 67, 3),
     "16 layers": ({"units": (1, 7) * 7 + (33,), "activation": SILU}, 37, 2),
     "16 layers of a decoder": ({"decoder": [3, *(5, 1) * 7, 9, 2]}, 5, 4),

@@ -185,6 +185,26 @@ def test_a_run_killed_in_the_middle_of_an_epoch_ends_as_if_it_had_not_been(
     assert same(weights(ob.load_model(out)), weights(whole))
 
 
+def test_a_run_resumed_with_another_backend_says_so_with_both_names(tmp_path, caplog):
+    def trained(epochs, backend):
+        caplog.clear()
+        config = ob.TrainConfig(epochs=epochs, batch_size=4)
+        model = ob.make_model("gru", TRAIN, **SMALL)
+        with ob.kernels.use(backend):
+            ob.fit(model, TRAIN, config=config, out=tmp_path, progress=False)
+            return model.backend()[0], [record.message for record in caplog.records]
+
+    first, said = trained(1, "auto")
+    assert said == []
+    assert trained(2, "auto") == (first, [])
+    other, said = trained(3, "reference")
+    if first == other:
+        pytest.skip("there is only one backend here")
+    (line,) = said
+    assert f"was trained with the backend {first}, and goes on with {other}" in line
+    assert f"OFFBEAT_SCAN={first}" in line
+
+
 def test_a_finished_run_is_not_trained_again(tmp_path):
     config = ob.TrainConfig(epochs=2, batch_size=4)
     first = ob.make_model("gru", TRAIN, **SMALL)

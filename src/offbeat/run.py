@@ -6,6 +6,7 @@ import csv
 import hashlib
 import io
 import json
+import logging
 import math
 import os
 import shutil
@@ -309,6 +310,8 @@ def save_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str
 def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[str, Any]) -> None:
     """Resumes from the last checkpoint of a run, if there is one.
 
+    A run of another backend is resumed with a warning that names both: the bits differ.
+
     Args:
         folder: of the run.
         model: gets the weights of the checkpoint.
@@ -343,6 +346,13 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
                 f"{folder} holds another run: {_WORDS[part]} differ{_difference(then, now)}; give "
                 "the same as then, or another folder"
             )
+    then, now = kept.get("backend"), model.backend()[0]
+    if then is not None and then != now:
+        logging.getLogger("offbeat").warning(
+            "%s was trained with the backend %s, and goes on with %s: the same up to rounding, but "
+            "not the same bits as in one go; OFFBEAT_SCAN=%s chooses the first one again",
+            folder, then, now, then,
+        )  # fmt: skip
     model.load_state_dict(weights)
     prefix = "optimizer."
     device = state.parameters.flat.device

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
@@ -160,8 +160,11 @@ def channel_panels(
         figure.align_ylabels(panels)
         if title:
             figure.suptitle(title, fontsize=9.5)
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        shown: dict[str, Any] = {}  # a panel may lack what another one has
+        for axes in panels:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                shown.setdefault(label, handle)
+        figure.legend([*shown.values()], [*shown], loc="outside lower center", ncols=4)
     return figure
 
 
