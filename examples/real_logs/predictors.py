@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import offbeat as ob
 from offbeat.answers.answer import Answer
-from offbeat.answers.blend import Blend, fit_blend, model_fills
+from offbeat.answers.blend import TASKS, Blend, fit_blend, model_fills
 from offbeat.baselines import BASELINES, fit_baseline
 from offbeat.learning import train_blend
 
@@ -185,7 +185,8 @@ def blend_of_baselines(log: Log, seed: int, quick: bool) -> Mapping[str, Predict
         log.train,
         log.validation,
         tasks=log.task_config,
-        count=100 if quick else log.drawn_tasks,
+        masks_of_data=bool(log.masked),
+        count=100 if quick else log.drawn_tasks or TASKS,
         seed=seed,
     )
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import Array, Rows, padded
+from offbeat.baselines.base import Array, Rows
 from offbeat.data.trajectory import Dataset
 
 OWN, EACH = 13, 10
@@ -147,10 +147,24 @@ class Gaps:
         self, c: int, near: NDArray[np.int64], task: NDArray[np.int64], row: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """(values, others) whether others are observed more often at a value and its neighbours."""
-        gap = DENSE * self.gap[task, row, c][:, None]
-        rows = (row, self._before[task, row, c], self._after[task, row, c])
-        enough = [self.spacing[task[:, None], at[:, None], near] <= gap for at in rows]
-        return np.asarray(np.all(enough, axis=0))
+        at = self._places(c, near, task, row)
+        return self._dense(self.spacing.reshape(-1), at, self.gap[task, row, c][:, None])
+
+    def _places(
+        self, c: int, near: NDArray[np.int64], task: NDArray[np.int64], row: NDArray[np.int64]
+    ) -> list[NDArray[np.int64]]:
+        """(values, others) of others in flattened arrays: at the value, before and after it."""
+        _, rows, channels = self.spacing.shape
+        first = task * rows
+        neighbours = (row, self._before[task, row, c], self._after[task, row, c])
+        return [((first + at) * channels)[:, None] + near for at in neighbours]
+
+    @staticmethod
+    def _dense(spacing: Array, at: list[NDArray[np.int64]], gap: Array) -> NDArray[np.bool_]:
+        found = spacing.take(at[0]) <= DENSE * gap
+        for place in at[1:]:
+            found &= spacing.take(place) <= DENSE * gap
+        return np.asarray(found)
 
     def others(
         self,
@@ -161,32 +175,33 @@ class Gaps:
         longest: float,
     ) -> Array:
         """(values, EACH * others) features of other channels."""
-        u = self.u[task, row, c][:, None]
-        before, after = self._before[task, row, c], self._after[task, row, c]
-        dense = self.dense(c, near, task, row)
-        columns = []
-        for array in (self.line, self.integral, self.slope):
-            here, left, right = (
-                array[task[:, None], at[:, None], near] for at in (row, before, after)
-            )
+        u, gap = self.u[task, row, c][:, None], self.gap[task, row, c][:, None]
+        at = self._places(c, near, task, row)
+        spacing, line = self.spacing.reshape(-1), self.line.reshape(-1)
+        dense, close = self._dense(spacing, at, gap), spacing.take(at[0]) <= DENSE * gap
+        columns = np.empty((len(task), EACH, len(near)))
+        ends = [line.take(place) for place in at[1:]]
+        for i, array in enumerate((line, self.integral.reshape(-1), self.slope.reshape(-1))):
+            left, right = ends if i == 0 else (array.take(place) for place in at[1:])
+            here = array.take(at[0])
             bend = here - left - u * (right - left)
-            columns += [np.where(dense, bend, 0.0), bend]
-        close = (
-            self.spacing[task[:, None], row[:, None], near]
-            <= DENSE * self.gap[task, row, c][:, None]
-        )
-        columns.append(np.where(close, self.slope[task[:, None], row[:, None], near], 0.0))
-        columns.append(np.where(close, self.line[task, row, c][:, None], 0.0))
-        gap = np.minimum(self.gap[task, row, c], longest)[:, None]
-        left, right = (self.line[task[:, None], at[:, None], near] for at in (before, after))
-        columns += [gap * u * (1 - u) ** 2 * left, gap * u**2 * (1 - u) * right]
-        return np.concatenate(columns, axis=1)
+            columns[:, 2 * i] = np.where(dense, bend, 0.0)
+            columns[:, 2 * i + 1] = bend
+        columns[:, 6] = np.where(close, here, 0.0)  # the slope
+        columns[:, 7] = np.where(close, self.line[task, row, c][:, None], 0.0)
+        used = np.minimum(gap, longest)
+        columns[:, 8] = used * u * (1 - u) ** 2 * ends[0]
+        columns[:, 9] = used * u**2 * (1 - u) * ends[1]
+        return columns.reshape(len(task), -1)
 
 
 def longest_gap(dataset: Dataset) -> float:
     """Longest time between observations of a channel on both sides of a hidden value, in s."""
     longest = 0.0
-    for rows in padded(dataset, SIZE):
-        gaps = Gaps(rows, np.zeros(dataset.channels), np.ones(dataset.channels))
-        longest = max(longest, float(gaps.gap[gaps.hidden].max(initial=0.0)))
+    for t in dataset:
+        for seen in t.observed.T:
+            at = np.flatnonzero(seen)
+            inside = np.diff(at) > 1
+            if inside.any():
+                longest = max(longest, float(np.diff(t.times[at])[inside].max()))
     return longest
