@@ -192,7 +192,7 @@ class Gaps:
         used = np.minimum(gap, longest)
         columns[:, 8] = used * u * (1 - u) ** 2 * ends[0]
         columns[:, 9] = used * u**2 * (1 - u) * ends[1]
-        return columns.reshape(len(task), -1)
+        return columns.reshape(len(task), EACH * len(near))
 
 
 def longest_gap(dataset: Dataset) -> float:
