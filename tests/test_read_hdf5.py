@@ -263,3 +263,60 @@ def test_a_data_set_that_minari_wrote_is_read(tmp_path, monkeypatch):
     for trajectory, values in zip(dataset, observed, strict=True):
         np.testing.assert_array_equal(trajectory.values[:, :4], values.astype(np.float64))
         np.testing.assert_allclose(np.diff(trajectory.times), 0.05)
+
+
+STAMPS_NS = 1_700_000_000_990_000_000 + np.array([0, 20, 40, 70, 90]) * 10**6
+WHOLE, REST = STAMPS_NS // 10**9, STAMPS_NS % 10**9
+
+
+class TestAStampInTwoArrays:
+    @pytest.mark.parametrize(
+        ("one", "two", "rest"),
+        [
+            ("sec", "nanosec", REST),
+            ("stamp.secs", "stamp.nsecs", REST),
+            ("header_stamp_sec", "header_stamp_nanosec", REST),
+            ("time_s", "time_us", REST // 1000),
+        ],
+    )
+    @pytest.mark.parametrize("given", [False, True])
+    def test_is_joined_to_the_nanosecond_and_is_no_channel(self, one, two, rest, given, tmp_path):
+        path = logs.write_robomimic(tmp_path / "a.hdf5", [demo(5, **{one: WHOLE, two: rest})])
+        dataset = read(path, **({"time_column": [one, two]} if given else {}))
+        assert np.array_equal(np.rint(dataset[0].times * 1e9), STAMPS_NS - STAMPS_NS[0])
+        assert not {one, two} & set(dataset.names)
+        assert any(f"joined from the arrays '{one}', '{two}'" in n
+                   for n in dataset.meta["cleaning"]["notes"])  # fmt: skip
+
+    def test_is_a_channel_where_the_numbers_are_no_stamp(self, tmp_path):
+        more = {"lap_s": np.array([1.5, 2.5, 3.5, 4.5, 5.5]), "lap_ms": np.arange(5.0)}
+        path = logs.write_robomimic(tmp_path / "a.hdf5", [demo(5, **more)])
+        assert {"lap_s", "lap_ms"} <= set(read(path, rate_hz=10.0).names)
+
+    def test_is_refused_by_name_where_it_is_not_clear(self, tmp_path):
+        two = {"a_sec": WHOLE, "a_nanosec": REST, "b_sec": WHOLE, "b_nanosec": REST}
+        path = logs.write_robomimic(tmp_path / "a.hdf5", [demo(5, **two)])
+        refused(path, r"has several stamps, each in two arrays: \[a_sec, a_nanosec\], \[b_sec")
+        assert read(path, time_column=["b_sec", "b_nanosec"])[0].times[-1] == pytest.approx(0.09)
+        refused(path, "must name one array, or two", InputError, time_column=["a_sec", "b_sec"])
+
+    def test_of_text_or_in_two_columns_of_an_array_is_refused_by_name(self, tmp_path):
+        texts = np.array([f"2026-01-01T00:00:0{i}" for i in range(5)], dtype="S")
+        for name, value, said in (
+            ("timestamp", texts, "times as text in /data/demo_0/obs/timestamp"),
+            ("stamp", np.column_stack([WHOLE, REST]), "a stamp in the two columns of /data/demo_0"),
+        ):
+            path = logs.write_robomimic(tmp_path / f"{name}.hdf5", [demo(5, **{name: value})])
+            refused(path, said)
+            assert read(path, rate_hz=5.0)[0].times[-1] == pytest.approx(0.8)
+
+
+def test_a_heap_of_texts_in_which_hdf5_would_loop_for_ever_is_refused(tmp_path):
+    path = tmp_path / "a.hdf5"
+    with h5py.File(path, "w") as file:
+        file.create_group("data").attrs["env_args"] = "{}" * 20  # a text of any length: in a heap
+    data = bytearray(path.read_bytes())
+    start = data.index(b"GCOL")
+    data[start + 16 : start + 32] = bytes(16)  # a free space of 0 bytes
+    path.write_bytes(data)
+    refused(path, "a heap of its texts has a free space of 0 bytes")

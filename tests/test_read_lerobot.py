@@ -234,3 +234,43 @@ def test_a_set_that_lerobot_wrote_itself_is_read():
             assert values[:3].tolist() == rng.normal(size=3).astype(np.float32).tolist()
             assert actions.tolist() == rng.normal(size=2).astype(np.float32).tolist()
     assert dataset[1].times.tolist() == (np.arange(9) / 10).tolist()
+
+
+NS = [1_700_000_000_990_000_000 + np.cumsum([0, *range(1, n)]) * 7_000_001 for n in LENGTHS]
+
+
+def with_pair(one, two, rest):
+    episodes = [
+        logs.lerobot_episode(i, n) | {one: NS[i] // 10**9, two: rest(NS[i])}
+        for i, n in enumerate(LENGTHS)
+    ]
+    kind = {"dtype": "int64", "shape": [1], "names": None}
+    return episodes, {one: kind, two: kind}
+
+
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize(
+    ("one", "two", "rest"),
+    [
+        ("sec", "nanosec", lambda ns: ns % 10**9),
+        ("observation.stamp.secs", "observation.stamp.nsecs", lambda ns: ns % 10**9),
+    ],
+)
+def test_a_stamp_in_two_columns_is_joined_and_is_no_channel(write, one, two, rest, given):
+    episodes, more = with_pair(one, two, rest)
+    options = {"time_column": [one, two]} if given else {}
+    dataset = read(write(episodes, features=logs.FEATURES | more), **options)
+    for trajectory, ns in zip(dataset, NS, strict=True):
+        assert np.array_equal(np.rint(trajectory.times * 1e9), ns - ns[0])
+    assert dataset.names == ("hip", "knee", "ankle", "action.left", "action.right")
+
+
+def test_several_stamps_in_two_columns_are_refused_by_name(write):
+    episodes, more = with_pair("a_sec", "a_nanosec", lambda ns: ns % 10**9)
+    others, again = with_pair("b_sec", "b_nanosec", lambda ns: ns % 10**9)
+    both = [one | other for one, other in zip(episodes, others, strict=True)]
+    root = write(both, features=logs.FEATURES | more | again)
+    refused(root, r"has several stamps, each in two columns: \[a_sec, a_nanosec\], \[b_sec")
+    dataset = read(root, time_column=["b_sec", "b_nanosec"])
+    assert np.array_equal(np.rint(dataset[1].times * 1e9), NS[1] - NS[1][0])
+    refused(root, "must name one column, or two", InputError, time_column=["a_sec", "b_sec"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import itertools
+import math
 import unicodedata
 from collections.abc import Iterable
 from types import ModuleType
@@ -77,8 +78,14 @@ def require(module: str, extra: str) -> ModuleType:
         ) from None
 
 
-def one_of(what: str, got: str, choices: Iterable[str]) -> str:
+def one_of(what: str, got: str, choices: Iterable[str], *, whole: bool = False) -> str:
     """Returns `got` when it is one of `choices`.
+
+    Args:
+        what: is chosen, for the message.
+        got: was given.
+        choices: that there are.
+        whole: list all of them, however long the message becomes.
 
     Raises:
         InputError: it is not; the message lists the choices, as many as fit, and the nearest one.
@@ -91,7 +98,7 @@ def one_of(what: str, got: str, choices: Iterable[str]) -> str:
     given = repr(got)
     if len(given) > _LONGEST_SHOWN:
         given = f"{given[:_LONGEST_SHOWN]}..."
-    room = _MOST_SHOWN - len(what) - len(given) - len(hint)
+    room = math.inf if whole else _MOST_SHOWN - len(what) - len(given) - len(hint)
     lengths = itertools.accumulate(len(name) + 2 for name in known)
     listed = sum(1 for _ in itertools.takewhile(lambda length: length <= room, lengths))
     more = f" and {len(known) - listed} more" if listed < len(known) else ""

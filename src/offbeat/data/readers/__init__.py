@@ -221,7 +221,7 @@ def _split(options: dict[str, Any], reader: Reader) -> tuple[dict[str, Any], dic
     for option in options:
         if not reader.options:
             raise InputError(f"the {reader.name} reader takes no options, got {option!r}")
-        one_of(f"option of the {reader.name} reader", option, reader.options)
+        one_of(f"option of the {reader.name} reader", option, reader.options, whole=True)
     own = {name: options[name] for name in reader.own_options if name in options}
     check_types(own, reader.function, f" of the {reader.name} reader")
     if reader.cleaning:

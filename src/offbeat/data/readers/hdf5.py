@@ -26,9 +26,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import state_time_unit, time_column_of, to_nanoseconds
+from offbeat.data.cleaning.clocks import (
+    is_rest,
+    join_stamp,
+    split_stamps,
+    state_time_unit,
+    time_column_of,
+    to_nanoseconds,
+)
 from offbeat.data.cleaning.options import is_number
 from offbeat.data.memory import require_memory
+from offbeat.data.readers.columns import columns_in, listed
 from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file, starts_with
@@ -61,7 +69,7 @@ def recordings(
     include_actions: bool = True,
     mask: str | None = None,
     rate_hz: float | None = None,
-    time_column: str | None = None,
+    time_column: str | Sequence[str] | None = None,
     time_unit: str | None = None,
 ) -> Iterator[Recording]:
     """Reads HDF5 of robomimic or Minari: a recording per episode, in the order of their numbers.
@@ -75,7 +83,8 @@ def recordings(
         rate_hz: rows per second. By default that of the environment, if the file has it; else
             rows are assumed to be 1 s apart, which is noted.
         time_column: array of the times, among the observations or beside them, such as
-            `timestamps`; by default one that is named like a time, see `TIME_NAMES`.
+            `timestamps`, or two that hold the stamp together, as `[sec, nanosec]`; by default found
+            by their names, see `TIME_NAMES`.
         time_unit: unit of those times; by default from their name, else detected.
 
     Yields:
@@ -238,7 +247,7 @@ def _episode(
     keys: Sequence[str] | None,
     actions: bool,
     rate: float,
-    time_column: str | None,
+    time_column: str | Sequence[str] | None,
     time_unit: str | None,
     given_rate: bool,
 ) -> Recording:
@@ -251,12 +260,13 @@ def _episode(
     left: list[str] = []
     arrays: dict[str, NDArray[np.float64]] = {}
     clock: tuple[str, NDArray[Any]] | None = None
-    for name, dataset in times.items():
-        _check_storage(dataset, path)
-        clock = name, dataset[()].reshape(-1)
+    if times:
+        clock, time_unit = _clock(times, path, time_unit)
     for name, dataset in leaves.items():
         chosen = keys is not None and any(key in keys for key in _prefixes(name))
         if keys is not None and not chosen:
+            continue
+        if name in times and not chosen:
             continue
         _refuse_objects(dataset, path)
         width = math.prod(dataset.shape[1:]) if dataset.shape else 0
@@ -265,8 +275,7 @@ def _episode(
         elif not chosen and (width > WIDEST or dataset.ndim > 3):
             left.append(f"{name} ({' x '.join(map(str, dataset.shape[1:]))})")
         elif width == 1 and not chosen and time_column_of([name]):
-            if name not in times:
-                left.append(f"{name} (a time)")
+            left.append(f"{name} (a time)")
         elif width:
             _check_storage(dataset, path)
             arrays[name] = np.asarray(dataset[()], dtype=np.float64).reshape(len(dataset), width)
@@ -288,12 +297,16 @@ def _episode(
                          notes=(f"{label} has no rows and is left out",))  # fmt: skip
     found = False
     if clock:
-        unit, more, found = state_time_unit(time_unit, clock[0], clock[1], str(path))
+        unit, more, found = state_time_unit(
+            time_unit, clock[0] if len(times) == 1 else "", clock[1], str(path)
+        )
         try:
             stamps, zero = to_nanoseconds(clock[1], unit)
         except FileFormatError as error:
             raise FileFormatError(f"{path}: {clock[0]!r} of {label}: {error}") from None
-        notes = (f"stamps are the array {clock[0]!r}", *more)
+        joined = len(times) == 2
+        what = f"joined from the arrays {listed([*times])}" if joined else f"the array {clock[0]!r}"
+        notes = (f"stamps are {what}", *more)
     else:
         unit, zero = "s", 0
         stamps = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
@@ -332,9 +345,16 @@ def _episode(
 
 
 def _times(
-    episode: Any, leaves: Mapping[str, Any], path: Path, given: str | None
+    episode: Any, leaves: Mapping[str, Any], path: Path, given: str | Sequence[str] | None
 ) -> dict[str, Any]:
-    """The array of times by its name: the one given, else one that is named like a time."""
+    """The array of times by its name, or the two that hold the stamp together.
+
+    It is the one given, else one that is named like a time.
+
+    Raises:
+        FileFormatError: the times are texts, or several pairs of arrays hold a stamp.
+        InputError: the one given is unknown.
+    """
     import h5py
 
     beside = {
@@ -344,15 +364,44 @@ def _times(
         if isinstance(array := _member(group, name, path), h5py.Dataset)
     }
     known = {**beside, **leaves}
+    usual = [name for name, array in known.items() if array.shape[1:] in ((), (1,)) and array.ndim]
+    pairs = _pairs({name: known[name] for name in usual}, path)
     if given is not None:
-        if given not in known:
-            one_of("time_column", given, known)
-        name = given
+        parts = columns_in(given, list(known))
+        for part in parts:
+            one_of("time_column", part, known)
+        if len(parts) == 2 and parts in pairs:
+            return {part: known[part] for part in parts}
+        if len(parts) != 1:
+            raise InputError(
+                f"{path}: time_column must name one array, or two with whole seconds and what is "
+                f"left of each in ns, us or ms, got {listed(parts)}"
+            )
+        name = parts[0]
     else:
-        usual = [name for name, array in known.items() if array.shape[1:] in ((), (1,))]
         name = time_column_of(usual) or ""
+        together = [pair for pair in pairs if name in pair or not name]
+        if len(together) > 1:
+            shown = ", ".join(f"[{one}, {two}]" for one, two in together[:3])
+            raise FileFormatError(
+                f"{path} has several stamps, each in two arrays: {shown}; say which one is the "
+                "time with time_column="
+            )
+        if together:
+            return {part: known[part] for part in together[0]}
+    wide = [n for n, array in known.items() if array.shape[1:] == (2,) and time_column_of([n])]
+    if not name and wide:
+        raise FileFormatError(
+            f"{path} has a stamp in the two columns of {known[wide[0]].name}; write it as one array "
+            "of seconds or integer nanoseconds, or state rate_hz="
+        )
     if not name:
         return {}
+    if known[name].dtype.kind in "SOU" and known[name].ndim == 1:
+        raise FileFormatError(
+            f"{path} has times as text in {known[name].name}, expected numbers; write them as "
+            "seconds or integer nanoseconds, or state rate_hz="
+        )
     array = known[name]
     if (
         array.dtype.kind not in "iuf"
@@ -365,6 +414,35 @@ def _times(
             f"{path}: {array.name} has shape {array.shape} and type {array.dtype}, expected times"
         )
     return {name: array}
+
+
+def _pairs(arrays: Mapping[str, Any], path: Path) -> list[tuple[str, str]]:
+    """Pairs of arrays that hold a stamp together, as `sec` and `nanosec`."""
+    found = []
+    for one, two, unit in split_stamps(list(arrays)):
+        both = arrays[one], arrays[two]
+        if all(array.dtype.kind in "iuf" for array in both):
+            for array in both:
+                _check_storage(array, path)
+            if is_rest(*(array[()].reshape(-1) for array in both), unit):
+                found.append((one, two))
+    return found
+
+
+def _clock(
+    times: Mapping[str, Any], path: Path, unit: str | None
+) -> tuple[tuple[str, NDArray[Any]], str | None]:
+    """The name and the numbers of a clock, and their unit where it is known."""
+    for array in times.values():
+        _check_storage(array, path)
+    first, *rest = times
+    if not rest:
+        return (first, times[first][()].reshape(-1)), unit
+    (_, _, of_rest), *_ = (
+        pair for pair in split_stamps([*times]) if [*pair[:2]] == [first, rest[0]]
+    )
+    whole, left = (array[()].reshape(-1) for array in times.values())
+    return (first, join_stamp(whole, left, of_rest)), "ns"
 
 
 def _leaves(node: Any, path: str, file: Path, depth: int = 0) -> Iterator[tuple[str, Any]]:

@@ -18,7 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import state_time_unit, to_nanoseconds
+from offbeat.data.cleaning.clocks import (
+    join_stamp,
+    split_stamps,
+    state_time_unit,
+    to_nanoseconds,
+)
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import is_list
 from offbeat.data.readers.lerobot_info import WIDEST, Feature, Info, Rows, read_columns
@@ -53,7 +58,7 @@ def recordings(
     episodes: Sequence[int] | int | None = None,
     columns: Sequence[str] | None = None,
     include_actions: bool = True,
-    time_column: str | None = None,
+    time_column: str | Sequence[str] | None = None,
     time_unit: str | None = None,
 ) -> Iterator[Recording]:
     """Reads a LeRobot data set: a recording per episode, in the order of their numbers.
@@ -66,8 +71,8 @@ def recordings(
             are numbers, except actions, rewards and bookkeeping.
         include_actions: whether the features `action` (or `actions`) and `action.*` are read;
             their channels have the role `action`.
-        time_column: column of the stamps; by default one that is named like a time and is not
-            row number / fps, else row number / fps.
+        time_column: column of the stamps, or two that hold them together, as `[sec, nanosec]`; by
+            default found by their names, if they are not row number / fps, else row number / fps.
         time_unit: unit of that column; by default from its name, else detected.
 
     Yields:
@@ -99,6 +104,9 @@ def recordings(
                 raise InputError(f"episodes must be numbers, got {number!r}")
         files = {number: files[number] for number in sorted(set(episodes))}
     chosen, notes = info.chosen(columns)
+    clocks = info.clocks(time_column)
+    if columns is None:  # what holds a stamp is no channel
+        chosen = [f for f in chosen if not any(f.name in clock for clock in clocks)]
     acted = [
         f
         for f in info.features.values()
@@ -107,7 +115,9 @@ def recordings(
     lengths = [at.length or 0 for at in files.values()]
     width = sum(feature.width for feature in (*chosen, *acted))
     require_rows(root, sum(lengths), width, "choose episodes= or columns=")
-    reading = _Reading(info, chosen, acted, time_column, time_unit, tuple(notes))
+    reading = _Reading(
+        info, chosen, acted, clocks, time_column is not None, time_unit, tuple(notes)
+    )
     for number, at in files.items():
         yield reading.recording(number, at)
 
@@ -120,7 +130,8 @@ class _Reading:
         info: Info,
         chosen: list[Feature],
         acted: list[Feature],
-        time_column: str | None,
+        clocks: list[tuple[str, ...]],
+        given: bool,
         time_unit: str | None,
         notes: tuple[str, ...],
     ) -> None:
@@ -129,13 +140,7 @@ class _Reading:
         self.acted = acted
         self.time_unit = time_unit
         self.notes = notes
-        self.given = time_column
-        if time_column is not None:
-            one_of("time_column", time_column, info.features)
-            self.clocks = [time_column]
-        else:  # measured stamps take precedence over LeRobot's
-            named = [f.name for f in info.features.values() if f.is_time]
-            self.clocks = sorted(named, key=lambda name: name == "timestamp")
+        self.given, self.clocks = given, clocks
         self.path: Path | None = None
         self.table: Any = None
 
@@ -143,7 +148,11 @@ class _Reading:
         """One episode."""
         if at.file != self.path:
             columns = dict.fromkeys(
-                [*self.clocks, "episode_index"] + [f.name for f in (*self.chosen, *self.acted)]
+                [
+                    *(name for clock in self.clocks for name in clock),
+                    "episode_index",
+                    *(f.name for f in (*self.chosen, *self.acted)),
+                ]
             )
             self.table, self.path = read_columns(at.file, list(columns)), at.file
             self.index = _column(self.table, "episode_index", 1, at.file)[:, 0]
@@ -190,11 +199,14 @@ class _Reading:
         """Nanoseconds, the clock at nanosecond 0, the column's unit, notes, and if it was found."""
         fps = self.info.fps
         grid = np.rint(np.arange(episode.num_rows) * (1e9 / fps)).astype(np.int64)
-        for name in self.clocks:
+        for name, *rest in self.clocks:
             clock = _raw(episode, name, file)
             unit, found = "s", False
             notes: tuple[str, ...] = ()
-            if name != "timestamp" or self.time_unit is not None:
+            if rest:
+                (_, _, of_rest), *_ = split_stamps([name, *rest])
+                clock, unit = join_stamp(clock, _raw(episode, rest[0], file), of_rest), "ns"
+            elif name != "timestamp" or self.time_unit is not None:
                 unit, notes, found = state_time_unit(
                     self.time_unit, name.rpartition(".")[2], clock, str(file)
                 )
@@ -204,9 +216,10 @@ class _Reading:
                 raise FileFormatError(f"{file}, column {name!r}: {error}") from None
             # LeRobot's stamps are float32: differences of 1 us, or 1e-6 relative, are on the grid.
             near = 1_000 + grid // 1_000_000
-            if self.given is None and (np.abs(stamps - stamps[:1] - grid) <= near).all():
+            if not self.given and (np.abs(stamps - stamps[:1] - grid) <= near).all():
                 continue
-            return stamps, zero, unit, (f"stamps are the column {name!r}", *notes), found
+            what = f"the column {name!r}" if not rest else f"joined from {name!r} and {rest[0]!r}"
+            return stamps, zero, unit, (f"stamps are {what}", *notes), found
         note = f"stamps are row number / {fps:g} fps, no times were recorded"
         return grid, 0, "s", (note,), False
 

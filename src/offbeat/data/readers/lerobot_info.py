@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from offbeat.data.cleaning.clocks import time_column_of
+from offbeat.data.cleaning.clocks import split_stamps, time_column_of
+from offbeat.data.readers.columns import columns_in
 from offbeat.data.readers.columns import listed as quoted
 from offbeat.data.readers.options import names
 from offbeat.data.source import inside, read_json, require_file
-from offbeat.errors import FileFormatError, one_of
+from offbeat.errors import FileFormatError, InputError, one_of
 
 WIDEST = 1024
 """Features with at least this many numbers per row are treated as images and left out."""
@@ -153,6 +154,41 @@ class Info:
                 f"choose with columns= from: {quoted(list(self.features), 12)}"
             )
         return chosen, [f"left out unless chosen with columns=: {', '.join(left)}"] if left else []
+
+    def clocks(self, given: str | Sequence[str] | None) -> list[tuple[str, ...]]:
+        """The features that may hold the stamps, the best first; two hold one stamp together.
+
+        Raises:
+            FileFormatError: several pairs hold a stamp.
+            InputError: those given are unknown, or hold no stamp together.
+        """
+        pairs = self._pairs()
+        if given is not None:
+            parts = columns_in(given, list(self.features))
+            for part in parts:
+                one_of("time_column", part, self.features)
+            if len(parts) != 1 and parts not in pairs:
+                raise InputError(
+                    f"{self.root}: time_column must name one column, or two with whole seconds and "
+                    f"what is left of each in ns, us or ms, got {quoted(parts)}"
+                )
+            return [parts]
+        named = [(f.name,) for f in self.features.values() if f.is_time]
+        single = [clock for clock in named if not any(clock[0] in pair for pair in pairs)]
+        measured = [clock for clock in single if clock != ("timestamp",)]
+        if len(pairs) > 1 and not measured:
+            raise FileFormatError(
+                f"{self.root} has several stamps, each in two columns: "
+                f"{', '.join(f'[{one}, {two}]' for one, two in pairs[:3])}; say which one is the "
+                "time with time_column="
+            )
+        # measured stamps take precedence over LeRobot's
+        return [*measured, *pairs[:1], *(clock for clock in single if clock not in measured)]
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        """Pairs of features of integers that hold a stamp together, as `sec` and `nanosec`."""
+        whole = [f.name for f in self.features.values() if f.width == 1 and "int" in f.dtype]
+        return [(one, two) for one, two, _ in split_stamps(whole)]
 
     def episode_files(self) -> dict[int, Rows]:
         """The file of each episode, by its number."""
