@@ -80,7 +80,8 @@ ZOO: dict[str, dict[str, Any]] = {
     "ode_rnn": {"vector_field": "mlp"},
     "ode_gru_d": {"decay": "trainable", "input_decay": True, "vector_field": "mlp"},
     "anchored_ode_gru_d": _ANCHORED,
-    "anchored_trend": {**_ANCHORED, "trend": True},
+    # Slopes widen the vector field's ends; its narrower inner layers make up for it.
+    "anchored_trend": {**_ANCHORED, "trend": True, "field_units": (96, 96, 96)},
     "anchored_trend_large": {
         **_ANCHORED,
         "trend": True,
