@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 import offbeat as ob
+from offbeat.answers.blend import model_rows
 from offbeat.calibration import (
     COVERED,
     LEVELS,
@@ -22,7 +24,8 @@ from offbeat.calibration import (
     normal_crps,
     normal_half_widths,
 )
-from offbeat.data.batch import Batch
+from offbeat.data.batch import Batch, last_index
+from offbeat.learning import GAUSSIAN
 from offbeat.metrics import ScoreSums
 from offbeat.plots.calibration import calibration_figure
 
@@ -161,3 +164,49 @@ def test_a_calibration_is_json_with_the_levels_that_are_shown():
     found = Calibration(3, LEVELS, same, same, 0.5).to_dict()
     assert found["coverage"] == {"0.5": 0.5, "0.8": 0.8, "0.95": 0.95}
     assert found["crps_scaled"] == 0.5
+
+
+@pytest.mark.parametrize("as_it_is", [True, False])
+def test_a_model_with_a_gaussian_head_is_blended_by_its_mean_and_scored_by_itself(as_it_is):
+    times = 0.02 * np.arange(400)
+    random = np.random.default_rng(0)
+    values = np.stack([np.sin(3 * times), np.cos(2 * times)], axis=1)
+    values += 0.1 * random.normal(size=values.shape)
+    log = ob.Dataset((ob.Trajectory(times, values),))
+    learned = ob.learn(
+        log,
+        model=ob.ModelConfig(head="gaussian", hidden_size=4, field_units=(6,)),
+        training=ob.TrainConfig(epochs=1, tasks_per_epoch=None if as_it_is else 16),
+        split=ob.SplitConfig(by="time", window=40, cut="consecutive") if as_it_is else None,
+        as_it_is=as_it_is,
+        two_sided=False,
+        baselines=["last_value", "constant_velocity", "linear"],
+        progress=False,
+    )
+    assert GAUSSIAN in learned.notes
+    blend = learned.blend
+    batch = blend.forward.batch(learned.test)
+    found = blend.forward(batch)
+    assert (found.scale > 0).all()
+    alone = replace(blend, gamma=np.ones_like(blend.gamma))
+    answers, rows = alone.causal(learned.test), model_rows(blend.forward, learned.test)
+    within = [~a.beyond & seen(t) for a, t in zip(answers, learned.test, strict=True)]
+    answered = np.concatenate([a.values[w] for a, w in zip(answers, within, strict=True)])
+    means = np.concatenate([m[w] for m, w in zip(rows, within, strict=True)])
+    assert len(means) > 50
+    assert answered == pytest.approx(means)
+    answer = blend.causal(learned.test)[0]
+    half = answer.half_widths()
+    assert half == pytest.approx(blend.widths.at(answer.key, answer.unit)), "conformal"
+    own = ob.evaluate(blend.forward, learned.test).scores[blend.forward.name].calibration
+    mean, scale, known = found.mean, found.scale, batch.targets & (last_index(batch.mask) >= 0)
+    error, spread = ((a[known]).detach().numpy() for a in (batch.values - mean, scale))
+    expected = scoringrules.crps_normal(error, 0.0, spread, backend="numpy").mean()
+    assert own.crps == pytest.approx(float(expected), rel=1e-5)
+
+
+def seen(trajectory):
+    """(rows, channels) whether a channel was observed in an earlier row."""
+    found = np.zeros_like(trajectory.observed)
+    found[1:] = np.logical_or.accumulate(trajectory.observed, axis=0)[:-1]
+    return found

@@ -29,6 +29,12 @@ BUDGET_S = 240.0
 SIMPLE = ("last_value", "mean", "constant_velocity", "damped_slope", "linear", "pchip")
 """Baselines of the blend of a data set as it is: those that are fitted at once."""
 
+GAUSSIAN = (
+    "the head 'gaussian' is trained on the likelihood, and its mean is blended; the intervals of "
+    "the blend come from errors on validation data, not from the standard deviation of the head"
+)
+"""Said where a model has a standard deviation of its own."""
+
 _FORWARD_SHARE = 0.7
 """Part of the budget for the ladder and the forward model; the rest is for the backward one."""
 
@@ -221,6 +227,8 @@ def train_blend(
     else:
         forward = make_model(model or "anchored_ode_gru_d", train, scaler=kind, seed=seed)
         fitted = fit(forward, train, validation, config, out=folder, **common)
+    if getattr(getattr(forward, "config", None), "head", None) == "gaussian":
+        said = (*said, GAUSSIAN)
     if fitted.diverged:
         said = (*said, fitted.diverged)
     backward = None
