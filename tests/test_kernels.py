@@ -29,19 +29,32 @@ SETS = cpu.instruction_sets() or ["none"]
 every_set = pytest.mark.parametrize("name", SETS)
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-10}
 
+LEAST = {torch.float32: 1e-2, torch.float64: 1e-3}
+"""Size at which a tensor of pure cancellation counts, as a fraction of all tensors' largest entry.
+
+A gradient of a weight is a sum over trajectories and rows, here of n <= 480 terms. Terms as large
+as the largest entry L that cancel leave an error of up to n u L, whatever the order of the sum,
+where u is half of the spacing of numbers at 1. In double precision n u = 480 x 1.1e-16 = 5e-14, and
+1e-3 x 1e-10 = 1e-13 is above it (largest of 792 random problems: 1.2e-6 x 1e-10). In
+single precision, 1e-3 x 1e-5 would be 0.17 u, less than a single rounding of one term, which no
+order of the sum attains; 1e-2 x 1e-5 is 1.7 u, far below n u. What is larger is allowed only as far
+as the reference backend has it, too.
+"""
+
 
 def agree(case: Problem, *, keep: bool = True, strict: bool = True) -> None:
     """Every instruction set runs this very call, or raises; all equal the reference backend.
 
     Where it is not `strict`, shapes are random, and a tensor may be all cancellation: its largest
-    entry counts as at least a hundredth of all tensors' largest, and in single precision it is
-    enough to be as near to double precision as the reference backend is, times three.
+    entry counts as at least the fraction `LEAST` of all tensors' largest, and in single precision
+    it is enough to be as near to double precision as the reference backend is, times three.
     """
     expected = run(reference.scan, case)
     exact = expected
     if not strict and case.state.dtype == torch.float32:
         exact = run(reference.scan, case.double())
-    least = 0.0 if strict else 1e-2 * max(float(v.abs().max()) for v in expected.values())
+    fraction = 0.0 if strict else LEAST[case.state.dtype]
+    least = fraction * max(float(v.abs().max()) for v in expected.values())
     allowed = {}
     for name, value in expected.items():
         assert bool(value.isfinite().all()), name

@@ -392,8 +392,8 @@ def _times(
     wide = [n for n, array in known.items() if array.shape[1:] == (2,) and time_column_of([n])]
     if not name and wide:
         raise FileFormatError(
-            f"{path} has a stamp in the two columns of {known[wide[0]].name}; write it as one array "
-            "of seconds or integer nanoseconds, or state rate_hz="
+            f"{path} has a stamp in the two columns of {known[wide[0]].name}; write it as one "
+            "array of seconds or integer nanoseconds, or state rate_hz="
         )
     if not name:
         return {}
