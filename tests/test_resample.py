@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,6 +14,7 @@ from test_cli import one_line_error
 
 import offbeat as ob
 from offbeat.answers.resample import describe, fit_simple_fill
+from offbeat.answers.usual_gaps import for_usual_gaps
 from offbeat.cli.app import main
 
 
@@ -73,14 +75,36 @@ def test_a_blend_of_a_run_fills_what_impute_fills(log):
     blend = fit_simple_fill(log)
     assert "smoother" in describe(blend)
     even = ob.resample(log, 30, blend)
-    filled = ob.impute(blend, log, times=even[0].times)
+    usual = for_usual_gaps(blend, log)
+    filled = ob.impute(usual, log, times=even[0].times)
     rows = np.searchsorted(filled[0].times, even[0].times)
-    gap = (even[0].times > 5.0) & (even[0].times < 5.3)
-    assert np.array_equal(even[0].values[gap, 0], filled[0].values[rows][gap, 0])
-    seen = log[0].observed[:, 1]
-    line = PchipInterpolator(log[0].times[seen], log[0].values[seen, 1])
-    assert even[0].values[gap, 1] == pytest.approx(line(even[0].times[gap]), abs=1e-12)
+    assert np.array_equal(even[0].values[1:], filled[0].values[rows][1:])
+    # No task masks one height alone so that its gap stays as short as usual.
+    bins, height = blend.both.keys.bins, 1
+    own = int(bins.of_age(np.array([0.05]))[0]) + len(bins)
+    longer = int(bins.of_age(np.array([0.1]))[0]) + len(bins)
+    assert own < longer
+    for before, after in ((blend.both.weights, usual.both.weights),
+                          (blend.both.widths.table, usual.both.widths.table)):  # fmt: skip
+        assert np.array_equal(after[own, height], before[longer, height])
+        assert np.array_equal(after[longer:, height], before[longer:, height])
     assert even.meta["filled_by"] == "blend"
+
+
+def test_intervals_hold_between_the_measurements_of_a_slow_sensor(log):
+    """Rows of a fast sensor lie there; nothing in a log masks such a value."""
+    random = np.random.default_rng(1)
+    noisy = log[0].values + random.normal(0, 0.02, log[0].values.shape)
+    one = replace(log[0], values=noisy)
+    blend = fit_simple_fill(ob.Dataset((one,)))
+    filled = ob.impute(for_usual_gaps(blend, ob.Dataset((one,))), one)[0]
+    inside = ~one.observed[:, 1]
+    inside[:10] = inside[-10:] = False
+    low, high = filled.interval(0.9)
+    truth = motion(one.times)[:, 1] + random.normal(0, 0.02, one.rows)
+    covered = ((low[:, 1] <= truth) & (truth <= high[:, 1]))[inside]
+    assert 0.8 < covered.mean() < 0.99
+    assert (high - low)[inside, 1].mean() < 0.2
 
 
 def test_a_log_too_short_to_fit_anything_is_filled_by_pchip():

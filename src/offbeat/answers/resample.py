@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from offbeat import baselines
 from offbeat.answers.answer import Answer
 from offbeat.answers.blend import Blend, fit_blend
 from offbeat.answers.impute import impute
+from offbeat.answers.usual_gaps import for_usual_gaps
 from offbeat.config import check_seed
 from offbeat.data.plan import CHOSEN, plan, prepare
 from offbeat.data.rows import add_rows, even_times
@@ -28,8 +27,6 @@ TWO_SIDED = ("linear", "pchip", "smoother")
 ALONE = "pchip"
 """Fills a log that is too short to fit anything to."""
 
-_FEW = 3  # observations of a channel
-_USUAL = 1.5  # gaps of up to this many median ones are usual
 _TASKS = 200  # drawn from each part, to weigh the baselines
 
 
@@ -48,10 +45,10 @@ def resample(
 
     Without a model, a blend of line, PCHIP and Kalman smoother is fitted to the data set itself
     (`fit_simple_fill`). A data set that is too short for this is filled by PCHIP, without
-    intervals. Between two measurements of a channel that lie as close as usual values are PCHIP's:
-    no task can validate another fill there, and intervals are those of gaps of twice that length.
-    Before the first observation of a channel its first value is held, and exogenous
-    channels, which are not predicted, hold their last one.
+    intervals. Between two measurements of a channel that lie as close as usual, a blend has the
+    weights and intervals of gaps of twice that length, the shortest that masking can validate
+    (`for_usual_gaps`). Before the first observation of a channel its first value is held, and
+    exogenous channels, which are not predicted, hold their last one.
 
     Args:
         dataset: what was observed.
@@ -84,12 +81,13 @@ def resample(
         mean = _means(dataset)
         filled = [_alone(t, at, mean) for t, at in zip(dataset, grids, strict=True)]
     else:
+        if isinstance(model, Blend):
+            model = for_usual_gaps(model, dataset)
         made = impute(model, dataset, times=grids, seed=seed)
         by = by or str(made.meta["filled_by"])
         dataset = dataset.select(made.names)
         filled = [
-            _within_usual_gaps(_rows_at(t, np.searchsorted(t.times, at)), given, model)
-            for t, at, given in zip(made, grids, dataset, strict=True)
+            _rows_at(t, np.searchsorted(t.times, at)) for t, at in zip(made, grids, strict=True)
         ]
     half = 0.5 / rate_hz * (1 + 1e-9)
     even = [
@@ -160,42 +158,6 @@ def _rows_at(trajectory: Trajectory, rows: NDArray[np.intp]) -> Trajectory:
         values=trajectory.values[rows],
         observed=trajectory.observed[rows],
     )
-
-
-def _within_usual_gaps(
-    filled: Trajectory, given: Trajectory, model: BaseModel | Blend
-) -> Trajectory:
-    """The trajectory with PCHIP between two measurements of a channel as close as usual.
-
-    The shortest gap that a task can mask is two of these. A blend has neither weights nor intervals
-    of its own for shorter ones, where another channel reports more often.
-    """
-    turned = {*model.transforms.angles, *(n for q in model.transforms.quaternions for n in q)}
-    values = filled.values.copy()
-    changed: list[NDArray[Any]] = []
-    if isinstance(filled, Answer) and isinstance(model, Blend):
-        assert filled.key is not None
-        assert filled.unit is not None
-        changed = [filled.key.copy(), filled.unit.copy()]
-    for c, name in enumerate(given.names):
-        seen = given.observed[:, c]
-        own = given.times[seen]
-        if len(own) < _FEW or name in turned or name not in model.names:
-            continue
-        usual = float(np.median(np.diff(own)))
-        after = np.searchsorted(own, filled.times, side="right")
-        inside = (after > 0) & (after < len(own))
-        after = np.clip(after, 1, len(own) - 1)
-        rows = inside & (own[after] - own[after - 1] <= _USUAL * usual)
-        values[rows, c] = PchipInterpolator(own, given.values[seen, c])(filled.times[rows])
-        if changed and isinstance(model, Blend):
-            bins = model.both.keys.bins
-            longer = int(bins.of_age(np.array([2 * usual]))[0]) + len(bins)  # in the middle of one
-            changed[0][rows, c] = longer
-            changed[1][rows, c] = model.both.units[longer, model.names.index(name)]
-    if isinstance(filled, Answer) and changed:
-        return replace(filled, values=values, key=changed[0], unit=changed[1])
-    return replace(filled, values=values)
 
 
 def _near(trajectory: Trajectory, times: NDArray[np.float64], half: float) -> NDArray[np.bool_]:
