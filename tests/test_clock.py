@@ -16,6 +16,7 @@ from offbeat.data.cleaning.clocks import (
     time_unit_in,
     to_nanoseconds,
 )
+from offbeat.data.readers import read
 from offbeat.errors import FileFormatError, InputError
 
 NOW_S = 1_714_564_800  # 2024-05-01 12:00:00 UTC
@@ -212,3 +213,24 @@ def test_seconds_since_1970_in_floats_are_as_near_as_a_float_is():
 def test_times_that_no_clock_shows_are_refused(clock, unit, message):
     with pytest.raises(FileFormatError, match=message):
         to_nanoseconds(np.array(clock), unit)
+
+
+@pytest.mark.parametrize(
+    ("start", "meaning"), [(45_000.25, "days since 1900"), (739_000.5, "days since the year 0")]
+)
+@pytest.mark.parametrize("hz", [1.0, 10.0, 100.0])
+def test_days_as_spreadsheets_count_them_are_found(start, meaning, hz, tmp_path):
+    """In float64, days since 1900 are exact to 1 us, days since the year 0 to 10 us."""
+    seconds = np.arange(300) / hz
+    unit, why = find_time_unit(start + seconds / 86_400)
+    assert unit == "d"
+    assert meaning in why
+    rows = [f"{start + t / 86_400:.12f},{np.sin(t):.6f}" for t in seconds]
+    (tmp_path / "a.csv").write_text("\n".join(["time,x", *rows]) + "\n")
+    assert np.abs(read(tmp_path / "a.csv")[0].times - seconds).max() < 2e-5
+
+
+def test_seconds_in_the_range_of_days_are_seconds():
+    for step in (1e-3, 0.01, 1.0):
+        assert find_time_unit(45_000 + step * np.arange(50)) == ("s", "")
+    assert find_time_unit(1e-6 * np.arange(50)) == ("s", "")

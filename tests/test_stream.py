@@ -468,3 +468,12 @@ def test_the_memory_of_the_process_stays_as_it_is_over_twenty_thousand_steps() -
     before = resident()
     live(5000, 20_000)
     assert resident() - before < 2 * 2**20
+
+
+@pytest.mark.parametrize("values", [[True, 1.0, 2.0], (1.0, False, 2.0), {"x": True}])
+def test_true_and_false_are_no_measurements(values: Any) -> None:
+    stream = Stream(small_model("gru"))
+    named = dict.fromkeys(stream.names[:1], True) if isinstance(values, dict) else values
+    with pytest.raises(InputError, match="True"):
+        stream.observe(0.0, named)
+    assert stream.counters.messages == 0

@@ -155,6 +155,8 @@ class RowReader:
     def _all(self, values: Any) -> NDArray[np.float64]:
         try:
             raw = np.asarray(without_mask(values, "values"))
+            if isinstance(values, list | tuple) and any(isinstance(v, bool) for v in values):
+                raise TypeError("one is True or False")
             if raw.dtype.kind not in "fiuO":
                 raise TypeError(f"they are {raw.dtype}")
             if raw.dtype.kind == "O":

@@ -192,7 +192,9 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
     seconds, milliseconds, microseconds, nanoseconds or ticks of 100 ns since 1970, or ticks since
     1601 (Windows) or the year 1 (.NET). A clock with another origin is in seconds, unless
     its median step would then be longer than 10 s and three steps or more agree. Then it is in the
-    unit, of `ms`, `us` and `ns`, with the rate closest to 100 Hz.
+    unit, of `ms`, `us` and `ns`, with the rate closest to 100 Hz. Days since 1900 (Excel) or since
+    the year 0 (MATLAB) from 2000 to 2100 are days, where seconds would be more than 50,000 rows a
+    second.
 
     Args:
         clock: (n,) numbers, in the order of the log.
@@ -212,15 +214,27 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
             return unit, f"numbers near {middle:.3g} are {meaning}"
     steps = np.diff(numbers)
     steps = steps[steps > 0]
-    if len(steps) < 3 or np.median(steps) <= _SLOWEST_S:
+    if len(steps) < 3:
         return "s", ""
     step = float(np.median(steps))
+    if step < _FASTEST_S:
+        for meaning, (first, last) in _DAYS.items():
+            if first <= middle <= last:
+                return "d", f"numbers near {middle:.6g}, {step:.2g} apart, are {meaning}"
+    if step <= _SLOWEST_S:
+        return "s", ""
     rates = {unit: 1e9 / NANOSECONDS_PER[unit] / step for unit in ("ms", "us", "ns")}
     unit = min(rates, key=lambda u: abs(np.log(rates[u] / _TYPICAL_HZ)))
     return (
         unit,
         f"a median step of {step:g} would be a row every {step:g} s, not {rates[unit]:g} Hz",
     )
+
+
+_DAYS = {"days since 1900": (36526.0, 73051.0), "days since the year 0": (730486.0, 767011.0)}
+"""Days of 2000 and 2100 as Excel and MATLAB count them."""
+
+_FASTEST_S = 2e-5
 
 
 class TimeUnit(NamedTuple):
