@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
@@ -160,7 +160,8 @@ def locked(folder: Path) -> Iterator[None]:
     """Locks the folder of a run for this process, for as long as the block runs.
 
     The lock of a process that has ended, however it ended, is void, and temporary files that it
-    left are removed. Inside of the block, the same thread can lock the folder again.
+    left are removed. Inside of the block, the same thread can lock the folder again. A folder that
+    was made for a block which wrote nothing into it, as for bad input, is removed.
 
     Args:
         folder: of the run; made if it is missing.
@@ -168,6 +169,7 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another training uses it.
     """
+    made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     if folder.resolve() in _held.get():
         yield
@@ -193,6 +195,10 @@ def locked(folder: Path) -> Iterator[None]:
             yield
         finally:
             _held.reset(token)
+            if made and [path.name for path in folder.iterdir()] == [LOCK]:
+                with suppress(OSError):  # where an open file cannot be removed
+                    (folder / LOCK).unlink()
+                    folder.rmdir()
 
 
 def identity_of(
