@@ -102,6 +102,7 @@ def remote(monkeypatch):
         ("ode_rnn", {"solver": "dopri5"}),
         ("ode_gru_d", {"solver": "rk4", "gradient": "adjoint"}),
         ("anchored_ode_gru_d", {}),
+        ("anchored_trend", {}),
     ],
 )
 def test_all_of_a_model_is_computed_on_its_device(name, options, remote, tmp_path):

@@ -35,7 +35,7 @@ HORIZON = 16
 FURTHEST = 10.0
 """A slope carries a level at most as far as it does in this many of the longest times tuned for."""
 
-CELLS = 15_000
+CELLS = 30_000
 """Most rows of all channels together that a search steps through."""
 
 KEPT = 8
