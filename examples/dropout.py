@@ -152,7 +152,10 @@ def main() -> None:
     frames = draw(whole, live, after, shown, span)
     frames[-1].save(Path(given.out).with_suffix(".png"))
     pause = [60] * (len(frames) - 1) + [2500]
-    palette = frames[-1].quantize(64)  # one for all frames: it has every colour
+    every = Image.new("RGB", (frames[0].width, 2 * frames[0].height))  # has every colour
+    every.paste(frames[int(0.55 * len(frames))], (0, 0))
+    every.paste(frames[-1], (0, frames[0].height))
+    palette = every.quantize(128)
     small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     small[0].save(given.out, save_all=True, append_images=small[1:], duration=pause, loop=0)
 
