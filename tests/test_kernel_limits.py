@@ -372,7 +372,6 @@ SHAPES: dict[str, tuple[dict[str, Any], int, int]] = {
                         "input_decay": True, "units": (5,)}, 3, 2),
     "1,000 anchored channels": ({"channels": 1000, "anchored": 1000, "units": (9,)}, 2, 2),
     "20,000 rows": ({}, 2, 20_000),
-    "20,000 rows of 1,000 channels": ({"channels": 1000, "units": (2,)}, 1, 20_000),
     "more trajectories than lanes": ({"units": (2,)}, 4099, 2),
     "one hidden unit": ({"hidden": 1, "units": (1,), "channels": 1}, 67, 3),
     "16 layers": ({"units": (1, 7) * 7 + (33,), "activation": SILU}, 37, 2),

@@ -264,8 +264,8 @@ def test_a_closed_error_output_and_a_full_disk_end_as_they_should(tmp_path, monk
         monkeypatch.setattr(full, "write", lambda text: os.write(full.fileno(), text.encode()))
         assert main(["inspect", "log.csv"]) == 2
         monkeypatch.undo()
-    line = "offbeat: error: the output can't be written: No space left on device\n"
-    assert capsys.readouterr().err == line
+    why = "No space left on device; free some space, then repeat the command"
+    assert capsys.readouterr().err == f"offbeat: error: the output can't be written: {why}\n"
 
 
 @pytest.mark.parametrize("seen", [10**400, "x", [], {}, True, 1e400])
