@@ -424,7 +424,8 @@ def _pairs(arrays: Mapping[str, Any], path: Path) -> list[tuple[str, str]]:
         if all(array.dtype.kind in "iuf" for array in both):
             for array in both:
                 _check_storage(array, path)
-            if is_rest(*(array[()].reshape(-1) for array in both), unit):
+            whole, rest = (array[()].reshape(-1) for array in both)
+            if is_rest(whole, rest, unit):
                 found.append((one, two))
     return found
 
