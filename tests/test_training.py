@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import shutil
 import signal
 import subprocess
 import sys
@@ -203,6 +204,20 @@ def test_a_run_resumed_with_another_backend_says_so_with_both_names(tmp_path, ca
     (line,) = said
     assert f"was trained with the backend {first}, and goes on with {other}" in line
     assert f"OFFBEAT_SCAN={first}" in line
+
+
+def test_older_checkpoints_of_a_killed_run_are_removed_by_the_next_one(tmp_path):
+    config = ob.TrainConfig(epochs=2, batch_size=4)
+    first = ob.make_model("gru", TRAIN, **SMALL)
+    ob.fit(first, TRAIN, config=config, out=tmp_path, progress=False)
+    (newest,) = (tmp_path / "checkpoints").iterdir()
+    for name in ("steps-000000001", "steps-000000002"):  # the second one is removed in part
+        shutil.copytree(newest, newest.with_name(name))
+    (newest.with_name("steps-000000002") / "config.json").unlink()
+    again = ob.make_model("gru", TRAIN, **SMALL)
+    ob.fit(again, TRAIN, config=config, out=tmp_path, progress=False)
+    assert same(weights(first), weights(again))
+    assert [*(tmp_path / "checkpoints").iterdir()] == [newest]
 
 
 def test_a_finished_run_is_not_trained_again(tmp_path):

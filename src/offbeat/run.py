@@ -360,6 +360,8 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
             folder, then, now, then,
         )  # fmt: skip
     model.load_state_dict(weights)
+    for old in checkpoints[:-1]:  # of a process that was killed before it removed them
+        shutil.rmtree(old)
     prefix = "optimizer."
     device = state.parameters.flat.device
     moments = {
