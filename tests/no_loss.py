@@ -23,6 +23,7 @@ from odd_logs import ODD_LOGS
 import offbeat as ob
 from offbeat.answers.blend import TASKS, Blend, fit_blend
 from offbeat.answers.scoring import forecast_tasks
+from offbeat.baselines import Baseline
 from offbeat.config import TaskConfig
 from offbeat.data.masking import masked_values
 from offbeat.data.plan import plan, prepare
@@ -144,7 +145,7 @@ def _asked(test: ob.Dataset, config: TaskConfig, horizons: Sequence[float]) -> I
 
 def _compared(log: str, blend: Blend, asked: Asked) -> Iterator[Compared]:
     answers = blend.fill(asked.dataset) if asked.both else blend.causal(asked.dataset)
-    simple = {n: m for n, m in blend.stack.members.items() if n in PAST}
+    simple: dict[str, Baseline] = {n: m for n, m in blend.stack.members.items() if n in PAST}
     if asked.both:
         simple |= {n: m for n, m in blend.both.members.items() if n in BOTH}
     every = {n: m.predict(asked.dataset) for n, m in simple.items()}
