@@ -95,6 +95,18 @@ def test_a_field_that_starts_linear_is_the_map_of_a_linear_system():
         start_linear(tanh, train)
 
 
+def test_a_training_goes_on_from_the_weights_of_another(tmp_path, monkeypatch, hopper):
+    options = {"hidden_size": 2, "field_units": (28,)}
+    first = Plan("first", 0.3, (0.3,), options, {"epochs": 1, "learning_rate": 0.01})
+    still = replace(first, training={"epochs": 1, "learning_rate": 1e-12}, after="small_fresh")
+    monkeypatch.setitem(models.PLANS, "small_fresh", first)
+    before, _ = models.train(first, hopper, tmp_path / "small_fresh-seed0")
+    after, results = models.train(still, hopper, tmp_path / "on")
+    assert [len(result.history) for result in results] == [1, 1]
+    for name, value in before.state_dict().items():
+        assert torch.allclose(value, after.state_dict()[name], atol=1e-9), name
+
+
 def test_the_command_keeps_scores_and_writes_the_tables(tmp_path, monkeypatch, hopper):
     options = {"hidden_size": 2, "field_units": (28,)}
     plan = Plan("tiny", 0.3, (0.3, 0.9), options, {"epochs": 1}, linear=True)

@@ -72,11 +72,14 @@ def _run(name: str, hopper: Hopper, fractions: list[float], options: argparse.Na
     if not open_:
         return
     if name in PLANS:
-        model, result = train(PLANS[name], hopper, options.runs / f"{name}-seed{seed}", seed=seed)
+        folder = options.runs / f"{name}-seed{seed}"
+        model, results = train(PLANS[name], hopper, folder, seed=seed)
+        history = [epoch for result in results for epoch in result.history]
         found["size"] = sum(p.numel() for p in model.parameters())
-        found["train_s"] = round(sum(epoch.seconds for epoch in result.history), 1)
-        found["epochs"], found["best_epoch"] = len(result.history), result.best_epoch
-        found["curve"] = [float(f"{e.validation_mse**0.5:.5g}") for e in result.history]
+        found["train_s"] = round(sum(epoch.seconds for epoch in history), 1)
+        found["epochs"] = len(history)
+        found["best_epoch"] = len(history) - len(results[-1].history) + results[-1].best_epoch
+        found["curve"] = [float(f"{e.validation_mse**0.5:.5g}") for e in history]
         found["backend"] = model.backend()[0]
     for fraction in open_:
         windows, _, test = hopper.parts(fraction)

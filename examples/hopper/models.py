@@ -12,6 +12,7 @@ import torch
 
 import offbeat as ob
 from offbeat.parts import Perceptron
+from offbeat.training import FitResult
 
 from .data import PROTOCOL, Hopper
 
@@ -27,6 +28,7 @@ class Plan:
         model: fields of `ModelConfig`.
         training: fields of `TrainConfig`.
         linear: whether the vector field starts as the linear model of one step.
+        after: another plan, whose trained weights are the initial ones; "" for none.
         name: entry of the zoo.
     """
 
@@ -36,6 +38,7 @@ class Plan:
     model: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     linear: bool = False
+    after: str = ""
     name: str = "anchored_ode_gru_d"
 
 
@@ -48,7 +51,7 @@ PLANS = {
         0.3,
         (0.3, 0.9),
         SMALL,
-        {"epochs": 100, "batch_size": 32, "learning_rate": 0.003},
+        {"epochs": 50, "batch_size": 32, "learning_rate": 0.003},
     ),
     "large_fresh": Plan(
         "anchored, large, fresh windows and masks",
@@ -58,20 +61,31 @@ PLANS = {
         {"epochs": 40, "batch_size": 32, "learning_rate": 0.003},
         linear=True,
     ),
+    "large_fresh_on": Plan(
+        "the same, trained on",
+        0.3,
+        (0.3, 0.9),
+        LARGE,
+        {"epochs": 25, "batch_size": 32, "learning_rate": 0.0015},
+        after="large_fresh",
+    ),
 }
 
 
-def train(plan: Plan, hopper: Hopper, out: Path, *, seed: int = 0) -> tuple[ob.Model, Any]:
+def train(
+    plan: Plan, hopper: Hopper, out: Path, *, seed: int = 0
+) -> tuple[ob.Model, tuple[FitResult, ...]]:
     """Trains a model, or goes on with a training that was stopped.
 
     Args:
         plan: what to train.
         hopper: the data.
-        out: folder of checkpoints and log.
+        out: folder of checkpoints and log; that of a plan before it lies beside it.
         seed: of weights, batches, windows and masks.
 
     Returns:
-        The model with the best weights on the validation windows, and the result of `fit`.
+        The model with the best weights on the validation windows, and the results of `fit`, that of
+        the plan before it first.
     """
     windows, validation, _ = hopper.parts(plan.drawn_for)
     model = ob.make_model(plan.name, windows, scaler=hopper.scaler, seed=seed, **plan.model)
@@ -79,10 +93,16 @@ def train(plan: Plan, hopper: Hopper, out: Path, *, seed: int = 0) -> tuple[ob.M
     if plan.fractions:
         redraw = ob.RedrawConfig(plan.fractions, PROTOCOL.window)
         data = hopper.whole(plan.drawn_for)[0]
-    if plan.linear:
+    earlier: tuple[FitResult, ...] = ()
+    if plan.after:
+        folder = out.parent / f"{plan.after}-seed{seed}"
+        before, earlier = train(PLANS[plan.after], hopper, folder, seed=seed)
+        model.load_state_dict(before.state_dict())
+    elif plan.linear:
         start_linear(model, data)
     config = ob.TrainConfig(seed=seed, redraw=redraw, **plan.training)
-    return model, ob.fit(model, data, validation, config, out=out, progress=False)
+    result = ob.fit(model, data, validation, config, out=out, progress=False)
+    return model, (*earlier, result)
 
 
 def start_linear(model: ob.Model, train: ob.Dataset) -> None:

@@ -191,7 +191,7 @@ def runs(found: dict[str, Any]) -> str:
 
 def _parameters(label: str) -> int:
     """Parameters of a model of the record."""
-    one = ob.Dataset((ob.Trajectory([0.0, 1.0], np.zeros((2, CHANNELS))),))
+    one = ob.Dataset((ob.Trajectory(np.arange(2.0), np.zeros((2, CHANNELS))),))
     model = ob.make_model(PROTOCOL.model_config(label), one)
     return sum(parameter.numel() for parameter in model.parameters())
 
