@@ -51,6 +51,10 @@ def test_scores_count_rows_after_the_first_observed_one_by_their_time_since(hopp
     window = replace(window.slice(0, 10), observed=observed)
     asked = scores.Questions(ob.Dataset((window,)), hopper.scaler)
     assert asked.age.tolist() == [[0, 0, 0, 1, 2, 1, 2, 3, 4, 5]]
+    switch = switches(asked.test)[0]
+    for row, age in enumerate(asked.age[0].tolist()):
+        if age:
+            assert asked.switched[0, row] == switch[row - age : row + 1].any()
     perfect = asked.score(asked.truth)
     assert perfect["rmse"] == 0
     error = np.zeros(10)

@@ -66,7 +66,7 @@ PLANS = {
         0.3,
         (0.3, 0.9),
         LARGE,
-        {"epochs": 25, "batch_size": 32, "learning_rate": 0.0015},
+        {"epochs": 16, "batch_size": 32, "learning_rate": 0.0015},
         after="large_fresh",
     ),
 }

@@ -145,14 +145,15 @@ def contacts(found: dict[str, Any]) -> str:
     rows = []
     for name, each in found["own"].items():
         for fraction in (0.9, 0.3):
-            runs = [run["scores"][str(fraction)] for run in each if str(fraction) in run["scores"]]
+            scored = [run["scores"].get(str(fraction), {}) for run in each]
+            runs = [found for found in scored if "near_switch_rows" in found]
             if runs:
                 mean = {
                     key: np.mean([run[key] for run in runs])
                     for key in (
-                        "switched_rows",
-                        "switched_error",
-                        "rmse_without_switch",
+                        "near_switch_rows",
+                        "near_switch_error",
+                        "rmse_elsewhere",
                         "worst_hundredth",
                     )
                 }
@@ -160,9 +161,9 @@ def contacts(found: dict[str, Any]) -> str:
                     [
                         _title(name),
                         f"{100 * fraction:.0f} %",
-                        f"{mean['switched_rows']:.0%}",
-                        f"{mean['switched_error']:.0%}",
-                        f"{mean['rmse_without_switch']:.4f}",
+                        f"{mean['near_switch_rows']:.0%}",
+                        f"{mean['near_switch_error']:.0%}",
+                        f"{mean['rmse_elsewhere']:.4f}",
                         f"{mean['worst_hundredth']:.0%}",
                     ]
                 )

@@ -35,9 +35,12 @@ class Questions:
         before = np.concatenate([np.full((len(at), 1), -1), at[:, :-1]], axis=1)
         self.counted = before >= 0
         self.age = np.where(self.counted, row - before, 0)
-        total = np.cumsum(switches(test), axis=1)
-        self.switched = total > np.take_along_axis(total, np.maximum(before, 0), axis=1)
-        """(trajectories, rows) whether a contact or limit changed since the last observed row."""
+        switch = switches(test)
+        total = np.cumsum(switch, axis=1)
+        at = np.maximum(before, 0)
+        first = np.take_along_axis(total - switch, at, axis=1)
+        self.switched = total > first
+        """(trajectories, rows) whether there is a switch from the last observed row to this one."""
 
     def score(self, predicted: Array) -> dict[str, Any]:
         """The scores of a predictor.
@@ -47,9 +50,8 @@ class Questions:
 
         Returns:
             RMSE after the first observation, in all and by time since observation; the fractions of
-            rows and of the squared error since whose last observation a contact or limit changed;
-            the fraction of the squared error in the worst hundredth of the rows; and the RMSE of
-            positions and velocities.
+            the rows that are `switched` and of their squared error; the fraction of the squared
+            error in the worst hundredth of the rows; and the RMSE of positions and velocities.
         """
         square = (predicted - self.truth) ** 2
         rows = square.mean(axis=2)[self.counted]
@@ -64,9 +66,9 @@ class Questions:
             "by_age": [_root(rows[some]) for some in of_age],
             "rows_by_age": [int(some.sum()) for some in of_age],
             "error_by_age": [float(rows[some].sum() / total) for some in of_age],
-            "switched_rows": float(switched.mean()),
-            "switched_error": float(rows[switched].sum() / total),
-            "rmse_without_switch": _root(rows[~switched]),
+            "near_switch_rows": float(switched.mean()),
+            "near_switch_error": float(rows[switched].sum() / total),
+            "rmse_elsewhere": _root(rows[~switched]),
             "worst_hundredth": float(worst.sum() / total),
             "rmse_positions": _root(square[..., :half].mean(axis=2)[self.counted]),
             "rmse_velocities": _root(square[..., half:].mean(axis=2)[self.counted]),
