@@ -32,6 +32,17 @@ def test_windows_are_those_of_the_thesis_and_belong_to_the_whole_trajectories(ho
             assert window.observed.any(axis=1).sum() == 30
 
 
+def test_no_trajectory_of_a_training_is_in_the_test_part_of_another_fraction(hopper):
+    trained = {t.origin for t in hopper.whole(0.3)[0]}
+    assert trained & {t.origin for t in hopper.parts(0.9)[2]}  # each fraction has its own split
+    train, _, test = hopper.parts(0.9, drawn_for=0.3)
+    assert {t.origin for t in train} == trained
+    assert not trained & {t.origin for t in test}
+    assert all(t.observed.any(axis=1).sum() == 90 for t in test)
+    for a, b in zip(hopper.parts(0.3, drawn_for=0.3)[2], hopper.parts(0.3)[2], strict=True):
+        assert np.array_equal(a.observed, b.observed)
+
+
 def test_a_contact_or_a_limit_that_begins_or_ends_is_a_switch(hopper):
     high = np.zeros(14)
     high[[1, 5]] = 3.0, 1.0  # m above where it stands; rad, the knee within its range

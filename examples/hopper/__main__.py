@@ -82,10 +82,14 @@ def _run(name: str, hopper: Hopper, fractions: list[float], options: argparse.Na
         found["curve"] = [float(f"{e.validation_mse**0.5:.5g}") for e in history]
         found["backend"] = model.backend()[0]
     for fraction in open_:
-        windows, _, test = hopper.parts(fraction)
+        drawn_for = PLANS[name].drawn_for if name in PLANS else None
+        windows, _, test = hopper.parts(fraction, drawn_for=drawn_for)
         asked = scores.Questions(test, hopper.scaler)
         own: dict[str, Any] = {}
         if name in PLANS:
+            last = fit_baseline("last_value", windows)
+            found_last = scores.baseline_predictions(last, test, hopper.scaler)
+            own = {"last_value_rmse": asked.score(found_last)["rmse"]}
             predicted = scores.predictions(model, test)
         else:
             started = time.process_time()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import mujoco  # type: ignore[import-untyped]
@@ -65,9 +65,19 @@ class Hopper:
         """The thesis' units: (x - min) / max over all rows."""
         return ob.Scaler.fit(PROTOCOL.scaler, self.recorded)
 
-    def parts(self, fraction: float) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset]:
-        """Training, validation and test windows with the masks of the thesis' repeat 0."""
-        return PROTOCOL.cut(self.recorded, run_of(fraction))
+    def parts(
+        self, fraction: float, *, drawn_for: float | None = None
+    ) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset]:
+        """Training, validation and test windows with the masks of the thesis' repeat 0.
+
+        Args:
+            fraction: observed part of the rows.
+            drawn_for: fraction whose windows and split are used, where a model is scored at others
+                than it was trained for: each has a split of its own, and trajectories that the
+                model was trained on must not be in its test part. Masks are then drawn anew.
+        """
+        run = run_of(drawn_for or fraction)
+        return PROTOCOL.cut(self.recorded, replace(run, observed_fraction=fraction))
 
     def whole(self, fraction: float) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset]:
         """The trajectories that the windows of `parts` are cut from, nothing masked."""

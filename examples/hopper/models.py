@@ -62,11 +62,11 @@ PLANS = {
         linear=True,
     ),
     "large_fresh_on": Plan(
-        "the same, trained on",
+        "anchored, large, fresh windows and masks, trained on",
         0.3,
         (0.3, 0.9),
         LARGE,
-        {"epochs": 16, "batch_size": 32, "learning_rate": 0.0015},
+        {"epochs": 12, "batch_size": 32, "learning_rate": 0.0015},
         after="large_fresh",
     ),
 }
