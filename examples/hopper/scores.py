@@ -38,7 +38,7 @@ class Questions:
         switch = switches(test)
         total = np.cumsum(switch, axis=1)
         at = np.maximum(before, 0)
-        first = np.take_along_axis(total - switch, at, axis=1)
+        first: NDArray[np.int64] = np.take_along_axis(total - switch, at, axis=1)
         self.switched = total > first
         """(trajectories, rows) whether there is a switch from the last observed row to this one."""
 
