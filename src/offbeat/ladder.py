@@ -65,8 +65,8 @@ def _anchored(name: str, rate: float, corrects: str | None = "damped_slope") -> 
 
 
 CANDIDATES = (
-    _anchored("anchored_trend", 0.006),
     _anchored("anchored_ode_gru_d", 0.006),
+    _anchored("anchored_trend", 0.006),
     _anchored("anchored_trend", 0.006, None),
     _anchored("anchored_ode_gru_d", 0.002),
 )
