@@ -254,7 +254,8 @@ def test_the_command_scores_every_predictor_on_every_task(ran):
         assert list(found) == (["one step", *fills, *HORIZONS] if result["causal"] else fills)
         assert all(0 < each["rmse_scaled"] < math.inf for each in found.values())
     assert first["machine"]["offbeat"]
-    assert (out / "real_lasa.png").read_bytes().startswith(b"\x89PNG")
+    for figure in ("real_lasa.png", "calibration_lasa.png"):
+        assert (out / figure).read_bytes().startswith(b"\x89PNG")
 
 
 def test_lines_of_a_table_are_root_mean_squares_over_the_values_of_their_channels(ran):

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from . import report
+from .figures import draw_calibration
 from .logs import LOGS, MissingLogError
 from .predictors import PREDICTORS
 from .results import Summary, path_of, run
@@ -56,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         body = report.tables(summary)
         if "offbeat" in summary.predictors and len(summary.tasks(summary.tests[0])) > 1:
             front.append(summary)
+        if options.figures:
+            draw_calibration(summary, summary.tests[0], options.figures / f"calibration_{name}.png")
         print(f"\n{log.title}\n\n{body}\n")
         every = f"# {log.title}\n\n{report.tables(summary, every=True)}\n"
         (files[0].parent / f"{'quick_' if options.quick else ''}tables.md").write_text(every)

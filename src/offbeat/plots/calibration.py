@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from offbeat.calibration import BAND, Calibration
 from offbeat.errors import InputError
@@ -12,10 +12,13 @@ from offbeat.plots.style import PAGE_WIDTH, RC
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = ("#000000", "#56B4E9", "#0072B2", "#F0E442", "#E69F00", "#D55E00", "#CC79A7", "#009E73")
-"""Of tasks in their order: the palette of Okabe and Ito (2008)."""
+COLOURS = (
+    *("#000000", "#56B4E9", "#0072B2", "#F0E442", "#E69F00"),
+    *("#D55E00", "#CC79A7", "#009E73", "#FFFFFF", "#7F7F7F"),
+)
+"""Of tasks in their order: the palette of Okabe and Ito (2008), white and grey."""
 
-MARKERS = "osD^vP*X"
+MARKERS = "osD^vP*XoD"
 
 
 def calibration_figure(tasks: Mapping[str, Calibration], *, title: str = "") -> Figure:
@@ -45,8 +48,11 @@ def calibration_figure(tasks: Mapping[str, Calibration], *, title: str = "") -> 
         left, right = figure.subplots(1, 2)
         left.plot([0, 100], [0, 100], color="#7F7F7F", linestyle=(0, (4, 2)), linewidth=1, zorder=1)
         for i, (name, found) in enumerate(tasks.items()):
-            look = {
-                "color": COLOURS[i % len(COLOURS)],
+            colour = COLOURS[i % len(COLOURS)]
+            look: dict[str, Any] = {
+                "color": "#1A1A1A" if colour == "#FFFFFF" else colour,
+                "markerfacecolor": colour,
+                "clip_on": False,
                 "marker": MARKERS[i % len(MARKERS)],
                 "linewidth": 1.1,
                 "markersize": 4.5,
