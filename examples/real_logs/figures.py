@@ -68,6 +68,8 @@ def draw_calibration(summary: Summary, test: str, path: Path) -> bool:
     for name in WITH_INTERVALS:
         for task in summary.tasks(test):
             for suffix, label in (("", task), ("_two_sided", f"{task}, both sides")):
+                if name + suffix not in summary.predictors:
+                    continue
                 found = summary.intervals(test, task, name + suffix)
                 if found is None or not found.score:
                     continue

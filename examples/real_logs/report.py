@@ -100,7 +100,11 @@ def tables(summary: Summary, *, every: bool = False) -> str:
             comparisons(summary, test, list(summary.predictors) if every else shown(summary, test)),
         ]
         if calibrated := intervals(summary, test):
-            parts += [f"{title}{INTERVALS}", calibrated]
+            more = "; interval score of 95 %" if _has_score(summary, test) else ""
+            parts += [
+                f"{title}coverage of 50 / 80 / 95 % intervals; CRPS{more}, scaled",
+                calibrated,
+            ]
     return "\n\n".join(parts)
 
 
@@ -146,9 +150,6 @@ def groups(summary: Summary, test: str) -> str:
             rows.append(row)
     return _table(["", "", *asked], rows)
 
-
-INTERVALS = "coverage of 50 / 80 / 95 % intervals; CRPS; interval score of 95 %, scaled"
-"""Title of the table of `intervals`."""
 
 KINDS = ("one step", "fill", "forecast")
 """First words of the names of tasks."""
@@ -251,6 +252,12 @@ def intervals(summary: Summary, test: str) -> str:
         if any(each):
             rows.append([_label(summary, name), *map(_calibration, each)])
     return _table(["", *summary.tasks(test)], rows) if rows else ""
+
+
+def _has_score(summary: Summary, test: str) -> bool:
+    """Whether a predictor has interval scores; results before 0.2.0 was finished have none."""
+    found = (summary.intervals(test, t, n) for n in summary.predictors for t in summary.tasks(test))
+    return any(each is not None and each.score for each in found)
 
 
 def _calibration(found: Intervals | None) -> str:
