@@ -222,3 +222,12 @@ def outages_of_rows(data):
             replace(t, observed=(np.arange(t.rows) % 30 < 20)[:, None] & t.observed) for t in data
         )
     )
+
+
+def test_a_blend_says_which_channels_are_filtered_together():
+    times = 0.05 * np.arange(300)
+    values = np.stack([np.sin(times), np.cos(times)], axis=1)
+    data = ob.Dataset((ob.Trajectory(times, values, names=("x", "vx"), units=("m", "m/s")),))
+    names = {"causal": ("last_value", "motion_filter"), "two_sided": ("linear",)}
+    notes = ob.fit_blend(data, data, count=30, **names).notes()
+    assert any(note.startswith("filtered together: x <- vx") for note in notes)
