@@ -69,6 +69,14 @@ PLANS = {
         {"epochs": 12, "batch_size": 32, "learning_rate": 0.0015},
         after="large_fresh",
     ),
+    "large_fresh_long": Plan(
+        "anchored, large, fresh windows and masks, trained on for longer",
+        0.3,
+        (0.3, 0.9),
+        LARGE,
+        {"epochs": 160, "batch_size": 32, "learning_rate": 0.003},
+        after="large_fresh",
+    ),
 }
 
 
