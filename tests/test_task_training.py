@@ -1,5 +1,6 @@
 """Training on tasks: errors in units of the best baseline, tasks of every epoch, corrections."""
 
+import json
 import math
 from dataclasses import asdict, replace
 
@@ -25,6 +26,7 @@ from offbeat.examples import (
     reference_tasks,
     relative_loss,
 )
+from offbeat.models.checkpoint import CONFIG, _digest
 from offbeat.models.corrected import CorrectedModel
 from offbeat.models.zoo import recipe_of
 
@@ -444,6 +446,21 @@ def test_a_gated_model_is_saved_and_read(tmp_path):
     loaded = ob.load_model(tmp_path / "model")
     for a, b in zip(ob.predict(model, VALIDATION), ob.predict(loaded, VALIDATION), strict=True):
         assert np.array_equal(a.values, b.values)
+
+
+def test_a_file_of_before_an_option_was_added_is_read_as_what_it_did(tmp_path):
+    model = corrected("damped_slope", nodes="rows", bounded=False)
+    model.save(tmp_path)
+    record = json.loads((tmp_path / CONFIG).read_text())
+    for option in ("nodes", "bounded", "trend"):
+        del record["model"]["inner"][option]
+    del record["config_sha256"]
+    record["config_sha256"] = _digest(record)
+    (tmp_path / CONFIG).write_text(json.dumps(record))
+    loaded = ob.load_model(tmp_path)
+    assert loaded.options == model.options
+    batch = model.batch(TRAIN)
+    assert torch.equal(loaded(batch).mean, model(batch).mean)
 
 
 def test_cells_are_the_bins_that_baselines_use():

@@ -178,12 +178,16 @@ def _build(record: dict[str, Any], weights: dict[str, Tensor]) -> BaseModel:
         transforms=Transforms.from_dict(record["transforms"]),
     )
     if "inner" in record["model"]:
-        parts = record["model"]
-        return CorrectedModel.restored(parts["inner"], parts["base"], data, weights)
+        inner = {**_ADDED, **record["model"]["inner"]}
+        return CorrectedModel.restored(inner, record["model"]["base"], data, weights)
     config = record["model"]
-    if "name" in config:  # a composed model, perhaps of a version without these options
-        config = {"nodes": "rows", "bounded": False, "trend": False, **config}
+    if "name" in config:  # a composed model
+        config = {**_ADDED, **config}
     return build(record["name"], config, data)
+
+
+_ADDED: dict[str, Any] = {"nodes": "rows", "bounded": False, "trend": False}
+"""Options that files of earlier versions lack, and what those versions did."""
 
 
 _RENAMED = {"age_input": "time_input", "age_unit": "time_input_unit"}
