@@ -74,7 +74,7 @@ PLANS = {
         0.3,
         (0.3, 0.9),
         LARGE,
-        {"epochs": 160, "batch_size": 32, "learning_rate": 0.003},
+        {"epochs": 110, "batch_size": 32, "learning_rate": 0.0015},
         after="large_fresh",
     ),
 }
