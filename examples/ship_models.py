@@ -72,11 +72,11 @@ def large_model(run: Path) -> None:
     name = run.name.rpartition("-seed")[0]
     found = json.loads((ROOT / f"results/robots/hopper/{run.name}.json").read_text())
     errors = {f: found["scores"][f]["rmse"] for f in ("0.9", "0.7", "0.5", "0.3")}
-    shown = ", ".join(f"{error:.4f} at {float(f):.0%}" for f, error in errors.items())
+    shown = ", ".join(f"{error:.4f} at {100 * float(f):.0f} %" for f, error in errors.items())
     sections = {
         "Data": "MuJoCo's hopper, falling: 7,000 trajectories of 200 rows at 5 ms; each epoch "
         "draws a window of 100 rows of each and observes 30 or 90 % of its rows.",
-        "Made by": f"`python -m examples.hopper --only {name} --runs {run.parent.name}`: "
+        "Made by": f"`python -m examples.hopper --only {name} --runs runs/hopper`: "
         f"{found['epochs']} epochs, {found['train_s'] / 60:.0f} min on one thread of an "
         f"{found['machine']['cpu']} ({found['backend']}), seed {found['seed']}.",
         "Scores": "Test RMSE after the first observation of each channel, in the thesis' units: "
