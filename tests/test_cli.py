@@ -369,10 +369,15 @@ def test_doctor_names_every_declared_dependency_with_its_version(capsys):
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
     declared = [*project["dependencies"]]
     for extra, names in project["optional-dependencies"].items():
-        declared += names if extra not in ("test", "bench") else []
+        declared += names if extra not in ("test", "bench", "hub") else []
     for text in declared:
         name = Requirement(text).name
         assert said[name] == importlib.metadata.version(name)
+    try:  # what the tests do not need
+        hub = importlib.metadata.version("huggingface-hub")
+    except importlib.metadata.PackageNotFoundError:
+        hub = "missing; pip install 'offbeat[hub]'"
+    assert said["huggingface-hub"] == hub
 
 
 def test_doctor_says_which_extra_brings_what_is_missing(monkeypatch):

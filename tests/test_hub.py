@@ -83,7 +83,8 @@ def test_a_hub_out_of_reach_is_an_error_of_one_line(hub):
         small_model("gru").push_to_hub("ana/arm")
 
 
-def test_a_repository_that_does_not_exist_and_a_name_that_is_none(hub):
+def test_a_repository_that_does_not_exist_and_a_name_that_is_none(hub, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ob.InputError, match="no repository 'ana/none'"):
         ob.Model.from_pretrained("ana/none")
     for name in ("arm", "a/b/c", "../x", "a b/c", ""):
