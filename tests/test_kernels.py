@@ -211,13 +211,7 @@ def test_the_last_steps_of_a_silence_alone_have_a_gradient(decay: str, keep: boo
         assert bool((gradient != 0).any()) == reached
 
 
-@needs_cpu
-@pytest.mark.parametrize("cell", [cell for cell in CELLS if cell != "none"])
-def test_gradients_equal_finite_differences(cell: str) -> None:
-    case = problem(
-        seed=3, batch=3, rows=4, channels=2, hidden=3, cell=cell, flow="heun", decay="delta",
-        input_decay=True, units=(4,), padded=True, dtype=torch.float64,
-    )  # fmt: skip
+def assert_gradients_are_finite_differences(case: Problem) -> None:
     spec, weights, rows, state, _ = case
     inputs = (*weights.tensors(), state)
 
@@ -225,6 +219,16 @@ def test_gradients_equal_finite_differences(cell: str) -> None:
         return cpu.scan(spec, case.with_weights(tensors[:-1]), rows, tensors[-1])
 
     assert torch.autograd.gradcheck(function, inputs, atol=1e-7, rtol=1e-5)
+
+
+@needs_cpu
+@pytest.mark.parametrize("cell", [cell for cell in CELLS if cell != "none"])
+def test_gradients_equal_finite_differences(cell: str) -> None:
+    case = problem(
+        seed=3, batch=3, rows=4, channels=2, hidden=3, cell=cell, flow="heun", decay="delta",
+        input_decay=True, units=(4,), padded=True, dtype=torch.float64,
+    )  # fmt: skip
+    assert_gradients_are_finite_differences(case)
 
 
 @needs_cpu
@@ -235,13 +239,7 @@ def test_gradients_of_a_trend_equal_finite_differences(flow: str, bounded: bool)
         seed=4, batch=3, rows=4, channels=2, hidden=3, cell="gru", flow=flow, anchored=True,
         trend=True, bounded=bounded, units=(4,), padded=True, dtype=torch.float64,
     )  # fmt: skip
-    spec, weights, rows, state, _ = case
-    inputs = (*weights.tensors(), state)
-
-    def function(*tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return cpu.scan(spec, case.with_weights(tensors[:-1]), rows, tensors[-1])
-
-    assert torch.autograd.gradcheck(function, inputs, atol=1e-7, rtol=1e-5)
+    assert_gradients_are_finite_differences(case)
 
 
 @needs_cpu
