@@ -177,7 +177,12 @@ class BaseModel(nn.Module):
         save_model(self, path)
 
     def save_pretrained(self, path: str | Path, *, card: str | None = None) -> None:
-        """Writes the model and a card, `README.md`; see `offbeat.models.hub.save_pretrained`."""
+        """Writes the model and a card, `README.md`, to a folder.
+
+        Args:
+            path: the folder; a model in it is replaced.
+            card: Markdown; by default what is known from the model itself.
+        """
         from offbeat.models.hub import save_pretrained
 
         save_pretrained(self, path, card=card)
@@ -186,14 +191,32 @@ class BaseModel(nn.Module):
     def from_pretrained(name: str | Path, *, revision: str | None = None) -> Any:
         """Reads a model from a folder, the package or the Hugging Face Hub.
 
-        See `offbeat.models.hub.from_pretrained`.
+        Args:
+            name: a folder; `offbeat/NAME`, as `offbeat models` lists; or `OWNER/NAME` of the hub.
+            revision: branch, tag or commit of the hub.
+
+        Raises:
+            FileFormatError: as `load_model`.
+            InputError: the name is none of these, or the hub has no such repository.
+            MissingExtraError: huggingface-hub is not installed, for a name of the hub.
+            OffbeatError: the hub is out of reach.
         """
         from offbeat.models.hub import from_pretrained
 
         return from_pretrained(name, revision=revision)
 
     def push_to_hub(self, repository: str, **options: Any) -> str:
-        """Uploads the model and a card; see `offbeat.models.hub.push_to_hub`."""
+        """Uploads the model and a card to the Hugging Face Hub; returns the address of the commit.
+
+        Args:
+            repository: `OWNER/NAME`; made where there is none.
+            **options: `card`, `private`, `token`, as of `offbeat.models.hub.push_to_hub`.
+
+        Raises:
+            InputError: the name is none of a repository.
+            MissingExtraError: huggingface-hub is not installed.
+            OffbeatError: the hub refuses, or is out of reach.
+        """
         from offbeat.models.hub import push_to_hub
 
         return push_to_hub(self, repository, **options)
