@@ -20,6 +20,7 @@ from offbeat.answers.predict import check_any_time
 from offbeat.baselines import Baseline, fill, fillers, forecasters
 from offbeat.baselines.history import typical_gap
 from offbeat.calibration import Calibration, CalibrationSums
+from offbeat.data.batch import delta
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import InputError
@@ -524,12 +525,10 @@ def channel_scale(model: BaseModel | Blend) -> NDArray[np.float64]:
     return np.asarray(np.abs(own.scaler.scale) * np.array(own.statistics.std))
 
 
-def _elapsed(trajectory: Trajectory) -> NDArray[np.float64]:
+def _elapsed(t: Trajectory) -> NDArray[np.float64]:
     """(rows, channels) s since the channel was observed in an earlier row; NaN where it was not."""
-    times = np.where(trajectory.observed, trajectory.times[:, None], np.nan)
-    before = np.full_like(times, np.nan)
-    before[1:] = np.fmax.accumulate(times, axis=0)[:-1]
-    return np.asarray(trajectory.times[:, None] - before)
+    never = torch.full((t.channels,), torch.nan, dtype=torch.float64)
+    return delta(torch.tensor(t.times), torch.tensor(t.observed), since=never).numpy()
 
 
 def _gap_lengths(trajectory: Trajectory) -> NDArray[np.float64]:
