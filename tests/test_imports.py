@@ -38,6 +38,8 @@ STAGES = (
     "evaluation",
     "stream",
     "export",
+    "env",
+    "policies",
     "comparison",
     "plots",
     "sweeps",
