@@ -186,3 +186,70 @@ def test_the_front_door_imports_nothing_heavy(code):
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == []
+
+
+ALONE = """
+import importlib.metadata, re, sys
+
+def needed(name, found):
+    if name not in found:
+        found.add(name)
+        for text in importlib.metadata.requires(name) or []:
+            other = re.match("[A-Za-z0-9_.-]+", text)[0].lower().replace("_", "-")
+            if "extra ==" not in text and other in installed:
+                needed(other, found)
+    return found
+
+owners = importlib.metadata.packages_distributions()
+owners = {top: {n.lower().replace("_", "-") for n in names} for top, names in owners.items()}
+installed = set().union(*owners.values())
+kept = {"pip", "setuptools", "offbeat"}
+for name in ("torch", "numpy", "safetensors"):
+    kept |= needed(name, set())
+hidden = {top for top, names in owners.items() if not kept & names} - {"tests", "thesis"}
+assert {"pyarrow", "jsonargparse", "matplotlib", "scipy", "yaml", "tqdm"} <= hidden, hidden
+assert not {"torch", "numpy", "safetensors"} & hidden
+
+class Without:
+    def __init__(self, finder): self.finder = finder
+    def __getattr__(self, name): return getattr(self.finder, name)
+    def find_spec(self, name, path=None, target=None):
+        return None if name.split(".")[0] in hidden else self.finder.find_spec(name, path, target)
+
+for name in [name for name in sys.modules if name.split(".")[0] in hidden]:
+    del sys.modules[name]
+sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
+"""
+"""Hides every installed package but torch, NumPy and safetensors, and what these need."""
+
+USED_ALONE = """
+import numpy as np, offbeat as ob
+from offbeat.cli.app import main
+
+times = np.cumsum(np.random.default_rng(0).uniform(0.05, 0.15, (12, 20)), axis=1)
+waves = [ob.Trajectory(t, np.stack([np.sin(3 * t), np.cos(3 * t)], 1)) for t in times]
+train, validation, test = ob.split(ob.mask_out(ob.Dataset(tuple(waves)), 0.7, seed=0))
+for name, options in (("anchored_trend", {}), ("gru", {"head": "gaussian"})):
+    model = ob.make_model(name, train, hidden_size=4, **options)
+    ob.fit(model, train, validation, ob.TrainConfig(epochs=1), out=f"{sys.argv[1]}/{name}")
+    model = ob.load_model(f"{sys.argv[1]}/{name}/model")
+    assert "last_value" in ob.evaluate(model, test).table()
+    ob.predict(model, test), ob.forecast(model, test, 0.2), ob.impute(model, test)
+    stream = ob.Stream(model)
+    stream.observe(0.0, [0.1, 0.2])
+    stream.predict(0.1)
+assert main(["doctor"]) == 0
+assert main(["models"]) == 2
+"""
+
+
+def test_models_are_made_fitted_and_used_with_torch_numpy_and_safetensors_alone(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE + USED_ALONE, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=250,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "which is not installed; install it with pip install offbeat" in done.stderr

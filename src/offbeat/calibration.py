@@ -54,9 +54,9 @@ def normal_half_widths(scale: ArrayLike, levels: Sequence[float] = LEVELS) -> Ar
         scale: (...) standard deviations.
         levels: probabilities of the intervals.
     """
-    from scipy.special import ndtri
+    import torch
 
-    wide = ndtri((1.0 + np.asarray(levels)) / 2.0)
+    wide = torch.special.ndtri(torch.tensor((1.0 + np.asarray(levels)) / 2.0)).numpy()
     return np.asarray(np.asarray(scale, dtype=np.float64)[..., None] * wide)
 
 
@@ -67,12 +67,13 @@ def normal_crps(error: ArrayLike, scale: ArrayLike) -> Array:
         error: (...) truth minus mean.
         scale: (...) standard deviations, above 0.
     """
-    from scipy.special import ndtr
+    import torch
 
     sigma = np.asarray(scale, dtype=np.float64)
     z = np.asarray(error, dtype=np.float64) / sigma
     density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
-    return np.asarray(sigma * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - math.pi**-0.5))
+    within = torch.special.erf(torch.tensor(z / math.sqrt(2.0))).numpy()
+    return np.asarray(sigma * (z * within + 2.0 * density - math.pi**-0.5))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,19 @@ FOR_DEVELOPERS = ("test", "bench")
 """Extras that users do not need."""
 
 
+NEEDED_FOR = {
+    "jsonargparse": "the commands need it",
+    "matplotlib": "figures need it",
+    "pillow": "moving pictures need it",
+    "pyarrow": "reading and writing files of data needs it",
+    "pyyaml": "the commands and the configs of sweeps need it",
+    "scipy": "blends of `learn`, PCHIP, ridge regression and the tests of `compare` need it",
+    "tqdm": "without it no progress is shown",
+}
+"""What works only with a dependency. All else, from `make_model` to `Stream`, needs torch, NumPy
+and safetensors alone; a machine with a GPU often has no others."""
+
+
 def examine() -> dict[str, Any]:
     """Versions, threads, scan backends and optional packages, by name."""
     import torch
@@ -33,8 +46,9 @@ def examine() -> dict[str, Any]:
         "instruction sets": ", ".join(cpu.instruction_sets()) or f"none: {cpu.why_not}",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
     }
-    for name, extra in dependencies():
+    for name, extra in dependencies() or [(name, "") for name in NEEDED_FOR]:
         fix = f"; pip install 'offbeat[{extra}]'" if extra else ""
+        fix = fix or (f"; {NEEDED_FOR[name]}" if name in NEEDED_FOR else "")
         found[name] = _version(name) or f"missing{fix}"
     return found
 

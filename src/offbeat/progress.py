@@ -1,11 +1,58 @@
-"""How long a step takes, shown on a terminal while it runs."""
+"""Progress bars, and how long a step takes, on a terminal; nothing without tqdm."""
 
 from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
+
+
+class _Silent:
+    """A progress bar that shows nothing, with the methods of one of tqdm that are used here."""
+
+    def __init__(self, items: Iterable[Any]) -> None:
+        self._items = items
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._items)
+
+    def __enter__(self) -> _Silent:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def update(self, n: float = 1) -> None:
+        """Does nothing, as do the others."""
+
+    def set_description(self, text: str) -> None:
+        """Does nothing."""
+
+    def set_postfix_str(self, text: str) -> None:
+        """Does nothing."""
+
+    def close(self) -> None:
+        """Does nothing."""
+
+
+def progress_bar(items: Iterable[Any] = (), *, show: bool = True, **options: Any) -> Any:
+    """A progress bar of tqdm; one that shows nothing where tqdm is not installed.
+
+    Args:
+        items: that a loop goes over, with `total` left out.
+        show: False shows nothing; nor is anything shown where standard error is no terminal.
+        **options: of tqdm: `total`, `desc`, `unit`, ...
+    """
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        return _Silent(items)
+    if "total" not in options:
+        options["iterable"] = items
+    return tqdm(disable=None if show else True, **options)
+
 
 _AFTER_S = 2.0
 _EVERY_S = 0.5
@@ -25,8 +72,11 @@ def busy(what: str, show: bool = True) -> Iterator[None]:
     if not show or sys.stderr is None or not sys.stderr.isatty():
         yield
         return
-    from tqdm import tqdm
-
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        yield
+        return
     ended = threading.Event()
 
     def wait() -> None:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from offbeat.baselines import Baseline
 from offbeat.config import Recipe, TrainConfig
@@ -35,6 +34,7 @@ from offbeat.files import writable
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import save_model
 from offbeat.models.zoo import recipe_of
+from offbeat.progress import progress_bar
 from offbeat.run import (
     EpochRecord,
     RunState,
@@ -427,10 +427,10 @@ def _tensorboard(folder: Path | None, state: RunState) -> Any:
 @contextmanager
 def _progress_bar(state: RunState, recipe: Recipe, trajectories: int, show: bool) -> Iterator[Any]:
     steps = math.ceil(trajectories / recipe.batch_size)
-    bar = tqdm(
+    bar = progress_bar(
         total=steps * recipe.epochs,
         initial=state.total_steps,
-        disable=None if show else True,  # None: where standard error is no terminal
+        show=show,
         unit="step",
         dynamic_ncols=True,
         mininterval=0.5,

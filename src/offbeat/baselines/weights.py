@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -321,6 +320,8 @@ def on_simplex(gram: Array, selected: float = 0.0) -> Array:
     # A row of large weight asks for the sum.
     strict = 1e3 * max(1.0, float(np.abs(linear).max()))
     system = np.vstack([root[:, None] * vectors.T, np.full(size, strict)])
+    from scipy.optimize import nnls
+
     found, _ = nnls(system, np.append(-linear, strict), maxiter=50 * size)
     return np.asarray(found / found.sum())
 

@@ -120,9 +120,16 @@ def run_commands(
     from argparse import ArgumentError
 
     from offbeat import __version__
-    from offbeat.cli.option_groups import reader_options, training_options
-    from offbeat.cli.parser import CommandParser
 
+    try:
+        from offbeat.cli.option_groups import reader_options, training_options
+        from offbeat.cli.parser import CommandParser
+    except ModuleNotFoundError as error:
+        given = list(sys.argv[1:] if argv is None else argv)
+        if given[:1] == ["doctor"] and "doctor" in commands:  # it says what else is missing
+            doctor_command(json="--json" in given)
+            return 0
+        return _missing(error)
     if sys.stderr is None:  # closed by the caller; progress bars and notes need one
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     groups = {"reader": reader_options, "training": training_options}
@@ -157,6 +164,8 @@ def run_commands(
         if isinstance(error, OSError) and error.strerror:
             said = _of_system(error, said)
         return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
+    except ModuleNotFoundError as error:
+        return _missing(error)
     except KeyboardInterrupt:
         return _fail("interrupted; the same command continues from the last checkpoint", 130)
     return 0
@@ -196,6 +205,21 @@ def _of_system(error: OSError, said: str) -> str:
         why = os.strerror(error.errno)
         return f"{where} can't be written: {why}; free some space, then repeat the command"
     return said if error.filename else f"the output can't be written: {error.strerror}"
+
+
+def _missing(error: ModuleNotFoundError) -> int:
+    """The exit code where a dependency is not installed; any other module that is missing raises.
+
+    With torch, NumPy and safetensors alone, models are made, fitted and used in Python.
+    """
+    name = (error.name or "").split(".")[0]
+    if name not in ("jsonargparse", "matplotlib", "PIL", "pyarrow", "scipy", "yaml"):
+        raise error
+    return _fail(
+        f"this needs the package {name}, which is not installed; install it with "
+        "pip install offbeat (python -m offbeat doctor lists what is missing)",
+        2,
+    )
 
 
 def _fail(message: str, code: int) -> int:

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from offbeat.data.arrays import hand_over
 from offbeat.data.robots import Control, Robot, channels_of, controls_of, load_model, robot_of
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.errors import DivergenceError, InputError, require
+from offbeat.progress import progress_bar
 
 _ROWS_PER_CHUNK = 32_768  # about 0.25 s: updates the progress bar, and keeps threads busy
 
@@ -143,9 +143,7 @@ def _roll_out(
     with (
         _collected_warnings(mujoco) as warnings,
         rollout.Rollout(nthread=threads if threads > 1 else 0) as pool,
-        tqdm(
-            total=len(states), desc=robot, unit=" trajectories", disable=None if progress else True
-        ) as bar,
+        progress_bar(total=len(states), desc=robot, unit=" trajectories", show=progress) as bar,
     ):
         for start in range(0, len(states), chunk):
             part = slice(start, min(start + chunk, len(states)))
@@ -173,9 +171,9 @@ def _step(
     values = np.empty((len(states), rows, states.shape[1]))
     acted = np.empty((len(states), rows, model.nu))
     stepped = np.empty((1, rows, 1 + states.shape[1]))
-    show = None if progress else True
     with _collected_warnings(mujoco) as warnings:
-        for i in tqdm(range(len(states)), desc=robot, unit=" trajectories", disable=show):
+        rows_of = range(len(states))
+        for i in progress_bar(rows_of, desc=robot, unit=" trajectories", show=progress):
             data = mujoco.MjData(model)
             data.qpos[:], data.qvel[:] = states[i, : model.nq], states[i, model.nq :]
             values[i, 0] = states[i]

@@ -9,13 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from offbeat.config import TrainConfig
 from offbeat.data.scaler import Scaler
 from offbeat.data.store import load
 from offbeat.errors import FileFormatError, OffbeatError
 from offbeat.models.zoo import make_model, recipe_of
+from offbeat.progress import progress_bar
 from offbeat.run import EpochRecord
 from offbeat.sweeps.engines import base
 from offbeat.sweeps.engines.local import LocalEngine
@@ -92,9 +91,7 @@ def train_side_by_side(jobs: Sequence[Job], *, workers: int, progress: bool = Tr
     waiting, running = list(jobs), list[str]()
     engine = LocalEngine(workers, 1)
     total = sum(recipe_of(job.name, job.training, validated=True).epochs for job in jobs)
-    with tqdm(
-        total=total, desc="training", unit="epoch", disable=None if progress else True
-    ) as bar:
+    with progress_bar(total=total, desc="training", unit="epoch", show=progress) as bar:
         try:
             while waiting or running:
                 while waiting and len(running) < workers:

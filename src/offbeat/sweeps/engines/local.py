@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from multiprocessing import connection
 from typing import Any
 
-from tqdm import tqdm
-
 from offbeat.data.memory import available_memory
 from offbeat.data.simulate import available_cores
 from offbeat.sweeps.engines.base import Ending, Engine, Job, attempt
@@ -97,7 +95,10 @@ class _Worker:
 def _serve(pipe: Any) -> None:
     """Loop of a worker process: runs jobs until the parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops this process
-    tqdm.set_lock(threading.RLock())  # by default a semaphore, which a killed process leaves behind
+    with suppress(ImportError):
+        from tqdm import tqdm
+
+        tqdm.set_lock(threading.RLock())  # the default, a semaphore, survives a killed process
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:
