@@ -139,6 +139,7 @@ def parsed(*arguments: str) -> dict[str, Any]:
         seed: int = 0,
         training: dict[str, Any] | None = None,
         reader: dict[str, Any] | None = None,
+        split: ob.SplitConfig = ob.SplitConfig(),  # noqa: B008
     ) -> None:
         """Take options."""
         given.update(locals())
@@ -224,6 +225,21 @@ def test_a_config_counts_where_nothing_is_typed_before_or_after_it(tmp_path):
     second.write_text("seed: 6\n")
     both = parsed(config, "--config", str(second))
     assert (both["seed"], both["two_sided"]) == (6, True)
+
+
+@pytest.mark.parametrize(
+    ("of_config", "typed", "expected"),
+    [
+        ("window: 100", "window_s=0.5", {"window_s": 0.5, "window": None}),
+        ("window_s: 0.5", "window=100", {"window_s": None, "window": 100}),
+        ("burst_rows: 5", "burst_s=0.5", {"burst_s": 0.5, "burst_rows": None}),
+    ],
+)
+def test_what_is_typed_in_seconds_replaces_rows_of_a_config(tmp_path, of_config, typed, expected):
+    path = tmp_path / "config.yaml"
+    path.write_text(f"split: {{{of_config}, seed: 3}}\n")
+    split = parsed("a", "b", f"--config={path}", f"--split.{typed}")["split"]
+    assert {name: getattr(split, name) for name in (*expected, "seed")} == {**expected, "seed": 3}
 
 
 def test_a_part_can_be_asked_for_on_the_data_of_the_run_alone(run, data, tmp_path, capsys):

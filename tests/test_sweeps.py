@@ -1,6 +1,8 @@
 """A sweep: any models on any data, paired by repeat, resumable, and read by `compare`."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.models.zoo import train_config
 from offbeat.sweeps.engines import local
+from offbeat.sweeps.engines.base import attempt
 from offbeat.sweeps.fingerprint import random_walks
 from offbeat.sweeps.record import Record
 
@@ -173,3 +176,18 @@ def test_the_command_sweeps_and_prints_the_comparison(tmp_path, capsys):
     assert [(pair["first"], pair["second"]) for pair in condition["pairs"]] == [("gru", "rnn")]
     assert main(command) == 0  # all is done: the record is read
     assert "paired t p" in capsys.readouterr().out
+
+
+def test_a_job_on_a_full_disk_fails_with_the_file_and_what_to_do():
+    class Job:
+        name = "gru-0"
+
+        def perform(self):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "runs/gru-0/log.csv")
+
+    failure = attempt(Job())
+    assert failure is not None
+    assert failure.message == (
+        f"gru-0: runs/gru-0/log.csv can't be written: {os.strerror(errno.ENOSPC)}; free some "
+        "space, then repeat the command"
+    )

@@ -174,6 +174,10 @@ SPLITS = ("trajectory", "time", "blocks")
 """Ways of splitting; see `offbeat.data.splits.apply_split`."""
 
 
+ROWS_OR_SECONDS = (("window", "window_s"), ("burst_rows", "burst_s"))
+"""Fields of `SplitConfig` that say the same, in rows and in seconds; one of both may be given."""
+
+
 @dataclass(frozen=True)
 class SplitConfig:
     """Options of windows, masks and the split into training, validation and test part.
@@ -233,7 +237,7 @@ class SplitConfig:
         _check(self, "gap_s", lambda v: 0 <= v < math.inf, "seconds of at least 0")
         for name in ("window_s", "burst_s"):
             _check(self, name, lambda v: 0 < v < math.inf, "a positive number of seconds")
-        for rows, seconds in (("window", "window_s"), ("burst_rows", "burst_s")):
+        for rows, seconds in ROWS_OR_SECONDS:
             if getattr(self, rows) is not None and getattr(self, seconds) is not None:
                 raise InputError(f"give {rows} or {seconds}, not both")
         if self.window is None and self.window_s is None and self.cut is not None:

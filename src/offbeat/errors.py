@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import importlib
 import itertools
 import math
+import os
 import unicodedata
 from collections.abc import Iterable
 from types import ModuleType
@@ -104,3 +106,18 @@ def one_of(what: str, got: str, choices: Iterable[str], *, whole: bool = False) 
     more = f" and {len(known) - listed} more" if listed < len(known) else ""
     shown = ", ".join(known[:listed]) + more
     raise InputError(f"unknown {what} {given}, expected one of: {shown}{hint}")
+
+
+def of_system(error: OSError) -> str:
+    """What an error of the system says to a user: which file it is about, and what to do.
+
+    Args:
+        error: of an operation on a file.
+    """
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        where, why = error.filename or "the output", os.strerror(error.errno)
+        return f"{where} can't be written: {why}; free some space, then repeat the command"
+    if not error.strerror:
+        return str(error)
+    where = error.filename or "the output can't be written"
+    return f"{where}: {error.strerror}"

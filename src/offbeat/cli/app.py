@@ -6,7 +6,6 @@ Torch and everything else that is slow to import is imported inside the function
 
 from __future__ import annotations
 
-import errno
 import inspect
 import logging
 import os
@@ -32,7 +31,7 @@ from offbeat.cli.simulate import simulate_command
 from offbeat.cli.stream import stream_command
 from offbeat.cli.sweep import sweep_command
 from offbeat.cli.train import train_command
-from offbeat.errors import OffbeatError, printable
+from offbeat.errors import OffbeatError, of_system, printable
 
 DESCRIPTION = """Learn robot motion from trajectories sampled at uneven times.
 
@@ -160,9 +159,8 @@ def run_commands(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (OffbeatError, OSError) as error:
-        said = parsers[command].spoken(str(error)) if command else str(error)
-        if isinstance(error, OSError) and error.strerror:
-            said = _of_system(error, said)
+        said = of_system(error) if isinstance(error, OSError) else str(error)
+        said = parsers[command].spoken(said) if command else said
         return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
     except ModuleNotFoundError as error:
         return _missing(error)
@@ -196,15 +194,6 @@ def _said(*, quiet: bool, verbose: bool) -> Iterator[None]:
         logger.removeHandler(handler)
         logger.setLevel(level)
         print(f"offbeat: {time.monotonic() - began:.1f} s", file=sys.stderr)
-
-
-def _of_system(error: OSError, said: str) -> str:
-    """What an error of the system says to a user: which file it is about, and what to do."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        where = error.filename or "the output"
-        why = os.strerror(error.errno)
-        return f"{where} can't be written: {why}; free some space, then repeat the command"
-    return said if error.filename else f"the output can't be written: {error.strerror}"
 
 
 def _missing(error: ModuleNotFoundError) -> int:

@@ -30,6 +30,7 @@ from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first
 )
 
 from offbeat import safe_yaml
+from offbeat.config import ROWS_OR_SECONDS
 
 set_parsing_settings(
     instantiate_subclass_spec_in_any=False,
@@ -183,10 +184,21 @@ class CommandParser(ArgumentParser):
             configs = first.parse_known_args(args)[0].config
             for config in configs:
                 namespace = self._read(Path(config), namespace)
+            self._drop_alternatives(args, namespace)
         try:
             return super().parse_args(args, namespace, **options)
         except ValueError as error:  # a value that names something to import
             raise ArgumentError(None, str(error)) from None
+
+    def _drop_alternatives(self, args: Sequence[str], of_config: Namespace | None) -> None:
+        """Removes from a config what the command line gives in another unit."""
+        given = {text.partition("=")[0].lstrip("-") for text in args if text.startswith("--")}
+        for pair in ROWS_OR_SECONDS:
+            for name, other in (pair, pair[::-1]):
+                replaced = f"split.{other}"
+                now_given = f"split.{name}" in given and replaced not in given
+                if now_given and of_config is not None and replaced in of_config:
+                    del of_config[replaced]
 
     def _refuse_pipes(self, args: Sequence[str]) -> None:
         """Raises an error for a group of options whose file would never end."""

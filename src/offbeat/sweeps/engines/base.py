@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from offbeat.errors import DivergenceError, OffbeatError
+from offbeat.errors import DivergenceError, OffbeatError, of_system
 
 
 class Job(Protocol):
@@ -87,7 +87,7 @@ def attempt(job: Job) -> Failure | None:
     except OffbeatError as error:
         return Failure(f"{job.name}: {error}", type(error))
     except OSError as error:
-        return Failure(f"{job.name}: {error}")
+        return Failure(f"{job.name}: {of_system(error)}")
     except Exception:
         return Failure(f"{job.name}: {traceback.format_exc()}")
     return None
