@@ -12,7 +12,7 @@ import offbeat as ob
 from offbeat.answers.blend import fit_blend, tables_of
 from offbeat.answers.both_sides import Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
-from offbeat.baselines.history import AgeBins
+from offbeat.baselines.history import AgeBins, carried
 from offbeat.baselines.stack import kinds_of
 from offbeat.baselines.weights import (
     Errors,
@@ -429,3 +429,72 @@ def test_cross_validated_errors_are_made_as_small_as_those_of_the_final_fit():
     better = as_if_refitted(cross, other, np.array([False, True]), 1)
     missed = better.predictions - truth[:, None]
     assert missed.std(axis=0) == pytest.approx([1.0, 1.0], rel=0.05)
+
+
+# --- between the measurements of a slow sensor ----------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two_rates():
+    """A walk at 100 Hz, and one with three times its steps that is measured in each tenth row.
+
+    The truth of every row, and a blend that was fitted to the measurements alone.
+    """
+    random = np.random.default_rng(5)
+    times = 0.01 * np.arange(1200)
+    truth, logs = [], []
+    for _ in range(6):
+        values = np.cumsum(random.normal(0, [0.1, 0.3], (1200, 2)), axis=0)
+        values -= 0.02 * np.cumsum(values, axis=0) / 10
+        truth.append(values)
+        shown = values.copy()
+        shown[np.arange(1200) % 10 > 0, 1] = np.nan
+        logs.append(ob.Trajectory(times, shown, names=("fast", "slow")))
+    task = TaskConfig(0.5, 0.01, 3.0, (("fast",), ("slow",)))
+    blend = fit_blend(
+        ob.Dataset(tuple(logs[:3])),
+        ob.Dataset(tuple(logs[3:5])),
+        tasks=task,
+        causal=("last_value", "damped_slope"),
+        two_sided=("linear", "pchip"),
+        count=150,
+    )
+    return blend, ob.Dataset((logs[5],)), truth[5]
+
+
+@pytest.mark.parametrize("mode", ["two_sided", "causal"])
+def test_intervals_hold_between_the_measurements_of_a_slow_sensor(two_rates, mode):
+    """No task asks for such a value, as it was never measured; here the truth is known."""
+    blend, log, truth = two_rates
+    filled = ob.impute(blend, log, mode=mode)[0]
+    inside = ~log[0].observed[:, 1]
+    inside[:20] = inside[-20:] = False
+    for level in (0.5, 0.9):
+        low, high = filled.interval(level)
+        covered = ((low <= truth) & (truth <= high))[inside, 1].mean()
+        assert level - 0.03 < covered, "an interval is too narrow"
+    # The walk moves by 0.3 sqrt(10) between two measurements: 90 % of that, and no more.
+    assert (high - low)[inside, 1].max() < 2 * 1.645 * 0.3 * np.sqrt(10) * 1.5
+
+
+def test_a_kind_that_no_task_has_takes_the_next_that_one_has(two_rates):
+    blend, _, _ = two_rates
+    bins, many = blend.both.keys.bins, len(blend.both.keys.bins)
+    usual, twice = (int(b) for b in bins.of_age(np.array([0.1, 0.2])))
+    assert usual < twice
+    for table in (blend.both.weights, blend.both.widths.table):
+        for kind in (usual, twice, many + usual):
+            assert np.array_equal(table[kind, 1], table[many + twice, 1])
+        assert not np.array_equal(table[many + usual, 0], table[many + twice, 0])
+    ages = blend.stack.keys.bins.of_age(np.array([0.01, 0.1]))
+    assert ages[0] < ages[1]
+    for table in (blend.stack.weights, blend.widths.table):
+        short, own = (table[3 * int(at) : 3 * int(at) + 3, 1] for at in ages)
+        assert np.array_equal(short, own)
+
+
+def test_bins_without_values_take_those_of_a_neighbour():
+    table = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]])
+    count = np.array([[0, 1], [1, 0], [0, 0], [2, 0]])
+    found = [[3, 2], [3, 2], [3, 2], [7, 2]]
+    assert carried(table, count).tolist() == found

@@ -14,7 +14,6 @@ from test_cli import one_line_error
 
 import offbeat as ob
 from offbeat.answers.resample import describe, fit_simple_fill
-from offbeat.answers.usual_gaps import for_usual_gaps
 from offbeat.cli.app import main
 
 
@@ -75,19 +74,9 @@ def test_a_blend_of_a_run_fills_what_impute_fills(log):
     blend = fit_simple_fill(log)
     assert "smoother" in describe(blend)
     even = ob.resample(log, 30, blend)
-    usual = for_usual_gaps(blend, log)
-    filled = ob.impute(usual, log, times=even[0].times)
+    filled = ob.impute(blend, log, times=even[0].times)
     rows = np.searchsorted(filled[0].times, even[0].times)
     assert np.array_equal(even[0].values[1:], filled[0].values[rows][1:])
-    # No task masks one height alone so that its gap stays as short as usual.
-    bins, height = blend.both.keys.bins, 1
-    own = int(bins.of_age(np.array([0.05]))[0]) + len(bins)
-    longer = int(bins.of_age(np.array([0.1]))[0]) + len(bins)
-    assert own < longer
-    for before, after in ((blend.both.weights, usual.both.weights),
-                          (blend.both.widths.table, usual.both.widths.table)):  # fmt: skip
-        assert np.array_equal(after[own, height], before[longer, height])
-        assert np.array_equal(after[longer:, height], before[longer:, height])
     assert even.meta["filled_by"] == "blend"
 
 
@@ -97,7 +86,7 @@ def test_intervals_hold_between_the_measurements_of_a_slow_sensor(log):
     noisy = log[0].values + random.normal(0, 0.02, log[0].values.shape)
     one = replace(log[0], values=noisy)
     blend = fit_simple_fill(ob.Dataset((one,)))
-    filled = ob.impute(for_usual_gaps(blend, ob.Dataset((one,))), one)[0]
+    filled = ob.impute(blend, one)[0]
     inside = ~one.observed[:, 1]
     inside[:10] = inside[-10:] = False
     low, high = filled.interval(0.9)

@@ -339,7 +339,7 @@ def test_a_corrected_baseline_gets_better_is_saved_and_resumed(tmp_path):
 
 def test_a_stack_of_baselines_can_be_corrected_and_saved(tmp_path):
     parts = [draw_tasks(data, TASKS, 60, seed=3) for data in (TRAIN, VALIDATION)]
-    stack, _, _ = fit_stack(("last_value", "damped_slope"), *parts, span_s=50.0, gap_s=0.05)
+    stack, *_ = fit_stack(("last_value", "damped_slope"), *parts, span_s=50.0, gap_s=0.05)
     model = CorrectedModel.of(ob.make_model("gru", TRAIN, **SMALL), stack, parts[0])
     with torch.no_grad():
         for parameter in model.parameters():

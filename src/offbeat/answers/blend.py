@@ -358,10 +358,10 @@ def fit_blend(
     if two_sided is None:
         two_sided = tuple(name for name, kind in usual.items() if not kind.causal)
     parts = drawn(before, 0)
-    stack, cells, held_out = fit_stack(causal, *parts, span_s=span, gap_s=gap)
+    stack, cells, held_out, source = fit_stack(causal, *parts, span_s=span, gap_s=gap)
     models = model_rows(model, parts[1], seed=seed)
     count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
-    errors = errors_of(cells, [held_out], count_of, stack.keys.groups)
+    errors = replace(errors_of(cells, [held_out], count_of, stack.keys.groups), source=source)
     gamma, answer = gated(
         errors,
         errors.predictions[:, 0],

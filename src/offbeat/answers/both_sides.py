@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
 from offbeat.baselines.base import Array, Baseline, fit_baseline
 from offbeat.baselines.folds import cross_fitted
-from offbeat.baselines.history import AgeBins
+from offbeat.baselines.history import AgeBins, usual_gaps
 from offbeat.baselines.stack import (
     arrays_of,
     independent_tasks,
     joined,
     members_of,
 )
-from offbeat.baselines.weights import Errors, as_if_refitted, gate, simplex_weights
+from offbeat.baselines.weights import Errors, as_if_refitted, gate, simplex_weights, sources
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 
@@ -132,6 +132,24 @@ class SideKeys:
         many = len(self.bins)
         inside, outside = np.arange(many), many + np.arange(many)
         return np.concatenate([inside, inside, outside, outside, [2 * many]])
+
+    def measured(self, usual: Array) -> NDArray[np.int64]:
+        """(keys, channels) the kind of the least length of a channel in tasks, or a longer one.
+
+        A task masks a value between two others, so the shortest gap of a channel in tasks is two
+        usual ones, and a value in it is as far from its edges as can be.
+
+        Args:
+            usual: (channels,) s, gaps of the channels.
+        """
+        many, own = len(self.bins), np.arange(len(self))[:, None]
+        at = np.append(np.tile(np.arange(many), 4), many)[:, None]
+        gap, outside = self.bins.of_age(2 * usual), self.bins.of_age(usual)
+        found = np.where(own >= 2 * many, own + np.maximum(outside - at, 0), own)
+        middle = many + np.maximum(at, gap)
+        found = np.where((own < many) & (at <= gap) | (own < 2 * many) & (at < gap), middle, found)
+        found[-1] = own[-1]
+        return np.asarray(found)
 
     def lengths(self) -> Array:
         """(keys,) s."""
@@ -263,6 +281,8 @@ def fit_both_sides(
         _errors(part.tasks, keys, units, reference, [*p, list(part.causal)], part.models, count)
         for part, p in ((train, predicted), (validation, later))
     ]
+    source = sources(flat[0][0], keys.measured(usual_gaps(train.tasks)))
+    flat = [(replace(errors, source=source), models) for errors, models in flat]
     bends = np.array([*(member.flexible for member in fitted.values()), False])
     cross = as_if_refitted(flat[0][0], flat[1][0], bends, channels)
     first = simplex_weights(cross, channels)

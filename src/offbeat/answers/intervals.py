@@ -82,7 +82,8 @@ def fit_half_widths(errors: Errors, predicted: Array, channels: int) -> HalfWidt
                 table[k, c] = pooled[k]
             elif own_share < 1:
                 table[k, c] = table[k, c] ** own_share * pooled[k] ** (1 - own_share)
-    return HalfWidths(np.maximum.accumulate(table, axis=2), effective.max(axis=1))
+    table = errors.placed(np.maximum.accumulate(table, axis=2))
+    return HalfWidths(table, effective.max(axis=1))
 
 
 def _filled(pooled: Array) -> Array:

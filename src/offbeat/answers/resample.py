@@ -11,7 +11,6 @@ from offbeat import baselines
 from offbeat.answers.answer import Answer
 from offbeat.answers.blend import Blend, fit_blend
 from offbeat.answers.impute import impute
-from offbeat.answers.usual_gaps import for_usual_gaps
 from offbeat.config import check_seed
 from offbeat.data.plan import CHOSEN, plan, prepare
 from offbeat.data.rows import add_rows, even_times
@@ -45,9 +44,7 @@ def resample(
 
     Without a model, a blend of line, PCHIP and Kalman smoother is fitted to the data set itself
     (`fit_simple_fill`). A data set that is too short for this is filled by PCHIP, without
-    intervals. Between two measurements of a channel that lie as close as usual, a blend has the
-    weights and intervals of gaps of twice that length, the shortest that masking can validate
-    (`for_usual_gaps`). Before the first observation of a channel its first value is held, and
+    intervals. Before the first observation of a channel its first value is held, and
     exogenous channels, which are not predicted, hold their last one.
 
     Args:
@@ -81,8 +78,6 @@ def resample(
         mean = _means(dataset)
         filled = [_alone(t, at, mean) for t, at in zip(dataset, grids, strict=True)]
     else:
-        if isinstance(model, Blend):
-            model = for_usual_gaps(model, dataset)
         made = impute(model, dataset, times=grids, seed=seed)
         by = by or str(made.meta["filled_by"])
         dataset = dataset.select(made.names)

@@ -144,6 +144,36 @@ def typical_gap(dataset: Dataset) -> float:
     return float(np.median(every)) if len(every) else 1.0
 
 
+def usual_gaps(dataset: Dataset) -> Array:
+    """(channels,) usual time between known values of each channel, in s; 0 where there is none.
+
+    The lower quartile, as values of a log may be missing.
+
+    Args:
+        dataset: masked values count.
+    """
+    usual = np.zeros(dataset.channels)
+    for c in range(dataset.channels):
+        gaps = np.concatenate([np.diff(t.times[t.known[:, c]]) for t in dataset])
+        if len(gaps):
+            usual[c] = np.quantile(gaps, 0.25)
+    return usual
+
+
+def carried(table: Array, count: Array) -> Array:
+    """A table whose bins without values have those of the bin before, the first ones of the next.
+
+    Args:
+        table: (bins, channels) of `AgeBins`.
+        count: (bins, channels) values that each entry comes from.
+    """
+    many = len(table)
+    at = np.where(count > 0, np.arange(many)[:, None], -1)
+    before = np.maximum.accumulate(at, axis=0)
+    after = np.minimum.accumulate(np.where(at >= 0, at, many - 1)[::-1], axis=0)[::-1]
+    return np.take_along_axis(table, np.where(before >= 0, before, after), axis=0)
+
+
 def longest_ages(dataset: Dataset) -> list[float]:
     """Longest time from an observation of a channel to a later known value, per trajectory, in s.
 

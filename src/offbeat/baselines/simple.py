@@ -16,7 +16,7 @@ from offbeat.baselines.base import (
     padded,
     stepped,
 )
-from offbeat.baselines.history import AgeBins, History
+from offbeat.baselines.history import AgeBins, History, carried
 from offbeat.data.trajectory import Dataset, Trajectory
 
 
@@ -93,7 +93,7 @@ class DampedSlope(ConstantVelocity):
     def estimate(self, tasks: Dataset) -> None:
         """See `Baseline`."""
         bins = AgeBins.of(tasks)
-        cross, square = (np.zeros((len(bins), tasks.channels)) for _ in range(2))
+        cross, square, count = (np.zeros((len(bins), tasks.channels)) for _ in range(3))
         channel = np.arange(tasks.channels)
         for rows in padded(tasks):
             last = stepped(_Of(self, LastValue.read), rows)
@@ -105,8 +105,10 @@ class DampedSlope(ConstantVelocity):
             move = (line - last)[counted]
             np.add.at(cross, where, move * (rows.values - last)[counted])
             np.add.at(square, where, move**2)
+            np.add.at(count, where, 1.0)
         self.edges = bins.edges
-        self.factor = np.clip(cross / np.where(square > 0, square, 1.0), 0.0, 1.5)
+        factor = np.clip(cross / np.where(square > 0, square, 1.0), 0.0, 1.5)
+        self.factor = carried(factor, count)
 
     def read(self, state: State, time: Any) -> Any:
         """See `CausalBaseline`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,10 @@ from offbeat.baselines.base import (
     stepped,
 )
 from offbeat.baselines.folds import cross_fitted
-from offbeat.baselines.history import AgeBins, History
+from offbeat.baselines.history import AgeBins, History, usual_gaps
 from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.simple import as_index, as_kind, channels_of
-from offbeat.baselines.weights import Errors, as_if_refitted, simplex_weights
+from offbeat.baselines.weights import Errors, as_if_refitted, simplex_weights, sources
 from offbeat.data.trajectory import Dataset
 
 ACTIVITY = (-1.5, -0.5)
@@ -117,6 +117,16 @@ class Keys:
     def groups(self) -> NDArray[np.int64]:
         """(keys,) group of each kind: its bin of the time since observation."""
         return np.append(np.repeat(np.arange(len(self.bins)), LEVELS), len(self.bins))
+
+    def measured(self, usual: Array) -> NDArray[np.int64]:
+        """(keys, channels) the kind of the least time of a channel in tasks, or a longer one.
+
+        Args:
+            usual: (channels,) s, gaps of the channels.
+        """
+        own = np.arange(len(self))[:, None]
+        longer = LEVELS * (self.bins.of_age(usual) - self.groups[:, None])
+        return np.asarray(own + np.where(own < len(self) - 1, np.maximum(longer, 0), 0))
 
     def ages(self) -> Array:
         """(keys,) s, upper end of the bin; infinite for the last kind."""
@@ -315,7 +325,7 @@ def fit_stack(
     *,
     span_s: float,
     gap_s: float,
-) -> tuple[Stack, Cells, list[Array]]:
+) -> tuple[Stack, Cells, list[Array], NDArray[np.int64]]:
     """Fits causal baselines to training tasks, and their weights to training and validation tasks.
 
     Of a flexible baseline, the errors on training tasks are those of a fit to other tasks.
@@ -328,8 +338,8 @@ def fit_stack(
         gap_s: s, its typical gap.
 
     Returns:
-        The stack, the values of the validation tasks, and the stack's predictions of these tasks
-        with weights fitted to the training tasks alone.
+        The stack, the values of the validation tasks, the stack's predictions of these tasks with
+        weights fitted to the training tasks alone, and (keys, channels) `Errors.source`.
     """
     stack = Stack()
     stack.mean, stack.scale = moments(train)
@@ -354,11 +364,13 @@ def fit_stack(
     stack.reach = np.zeros(train.channels)
     np.maximum.at(stack.reach, cells[0].channel, np.abs(moves))
     flexible = np.array([member.flexible for member in stack.members.values()])
+    source = sources(errors[0], stack.keys.measured(usual_gaps(train)))
+    errors = [replace(e, source=source) for e in errors]
     errors[0] = as_if_refitted(errors[0], errors[1], flexible, train.channels)
     stack.weights = simplex_weights(errors[0], train.channels)
     held_out = stack.mix(later, validation)
     stack.weights = simplex_weights(joined(errors), train.channels)
-    return stack, cells[1], held_out
+    return stack, cells[1], held_out, source
 
 
 def joined(errors: Sequence[Errors]) -> Errors:
@@ -372,6 +384,7 @@ def joined(errors: Sequence[Errors]) -> Errors:
         np.concatenate([e.predictions for e in errors]),
         errors[0].count,
         errors[0].group,
+        errors[0].source,
     )
 
 

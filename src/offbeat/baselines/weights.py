@@ -62,6 +62,8 @@ class Errors:
         predictions: (values, predictors) the same of each prediction.
         count: independent tasks per key, at most.
         group: group of each key; kinds of one group are alike. By default each is its own.
+        source: (keys, channels) kind whose results each kind has, where it is another one; see
+            `sources`. By default each has its own.
     """
 
     key: Integers
@@ -71,6 +73,7 @@ class Errors:
     predictions: Array
     count: Array
     group: Integers | None = None
+    source: Integers | None = None
 
     @property
     def groups(self) -> Integers:
@@ -84,15 +87,43 @@ class Errors:
 
     def only(self, chosen: NDArray[np.bool_]) -> Errors:
         """Some of the values."""
-        return Errors(
-            self.key[chosen],
-            self.channel[chosen],
-            self.task[chosen],
-            self.truth[chosen],
-            self.predictions[chosen],
-            self.count,
-            self.group,
+        return replace(
+            self,
+            key=self.key[chosen],
+            channel=self.channel[chosen],
+            task=self.task[chosen],
+            truth=self.truth[chosen],
+            predictions=self.predictions[chosen],
         )
+
+    def placed(self, table: Array) -> Array:
+        """A table in which every kind has the results of its `source`.
+
+        Args:
+            table: (keys, channels, ...) of each kind by itself.
+        """
+        if self.source is None:
+            return table
+        return np.asarray(table[self.source, np.arange(table.shape[1])])
+
+
+def sources(errors: Errors, measured: Integers) -> Integers:
+    """The kind whose weights, gamma and widths each kind and channel has.
+
+    A task masks measured values, so it has none at times since observation below the usual ones of
+    its channel. What is known about others, which report more often, does not hold there.
+
+    Args:
+        errors: of tasks.
+        measured: (keys, channels) the kind of the least time that tasks of the channel have; of
+            longer times, the kind itself.
+
+    Returns:
+        (keys, channels) that kind, where the channel has fewer than `POOLED` tasks of the other.
+    """
+    _, effective = task_weights(errors, measured.shape[1])
+    own = np.arange(errors.keys)[:, None]
+    return np.asarray(np.where(effective < POOLED, measured, own))
 
 
 def task_weights(errors: Errors, channels: int) -> tuple[Array, Array]:
@@ -211,7 +242,7 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
             weights[key, channel] = on_simplex(total, part)
         mixed = weights.reshape(-1, predictors)[cells.place]
         squares = cells.squares((mixed * missed).sum(axis=1))
-    return weights
+    return errors.placed(weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,7 +394,7 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     # No least-squares factor is larger (Cauchy and Schwarz): where the model moves much further
     # than the base is wrong, what it says in other channels does not count.
     largest = np.sqrt(least / np.maximum(square, 1e-300))
-    return np.asarray(np.clip(np.minimum(gamma, largest), 0.0, 1.0))
+    return errors.placed(np.clip(np.minimum(gamma, largest), 0.0, 1.0))
 
 
 def _robust(missed: Array) -> Array:
