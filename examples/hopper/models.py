@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,12 @@ import numpy as np
 import torch
 
 import offbeat as ob
+from offbeat.data.redraw import redraw
 from offbeat.parts import Perceptron
 from offbeat.training import FitResult
 
 from .data import PROTOCOL, Hopper
+from .direct_gru import DIRECT_GRU
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Plan:
         title: in tables.
         drawn_for: fraction whose windows of the thesis give split, scales and validation.
         fractions: that are trained on; empty for the thesis' windows and masks, kept in all epochs.
+        kept: `windows` or `masks`, which are then drawn once; "" for both anew in each epoch.
         model: fields of `ModelConfig`.
         training: fields of `TrainConfig`.
         linear: whether the vector field starts as the linear model of one step.
@@ -35,6 +38,7 @@ class Plan:
     title: str
     drawn_for: float
     fractions: tuple[float, ...]
+    kept: str = ""
     model: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     linear: bool = False
@@ -45,39 +49,63 @@ class Plan:
 SMALL = {"hidden_size": 32, "field_units": (100, 100, 100)}
 LARGE = {"hidden_size": 64, "field_units": (256, 256, 256)}
 
+FULL: dict[str, Any] = {
+    "drawn_for": 0.3,
+    "fractions": (0.3, 0.9),
+    "model": LARGE,
+    "training": {"epochs": 40, "batch_size": 32, "learning_rate": 0.003},
+    "linear": True,
+}
+"""The large model, from which each plan of `ABLATION` differs in one thing."""
+
 PLANS = {
-    "small_fresh": Plan(
-        "anchored, small, fresh windows and masks",
-        0.3,
-        (0.3, 0.9),
-        SMALL,
-        {"epochs": 50, "batch_size": 32, "learning_rate": 0.003},
-    ),
-    "large_fresh": Plan(
-        "anchored, large, fresh windows and masks",
-        0.3,
-        (0.3, 0.9),
-        LARGE,
-        {"epochs": 40, "batch_size": 32, "learning_rate": 0.003},
-        linear=True,
-    ),
+    "large_fresh": Plan("anchored, large, 40 epochs", **FULL),
     "large_fresh_on": Plan(
-        "anchored, large, fresh windows and masks, trained on",
-        0.3,
-        (0.3, 0.9),
-        LARGE,
-        {"epochs": 12, "batch_size": 32, "learning_rate": 0.0015},
+        "anchored, large, 52 epochs",
+        **{
+            **FULL,
+            "training": {"epochs": 12, "batch_size": 32, "learning_rate": 0.0015},
+            "linear": False,
+        },
         after="large_fresh",
     ),
     "large_fresh_long": Plan(
-        "anchored, large, fresh windows and masks, trained on for longer",
-        0.3,
-        (0.3, 0.9),
-        LARGE,
-        {"epochs": 110, "batch_size": 32, "learning_rate": 0.0015},
+        "anchored, large, 150 epochs",
+        **{
+            **FULL,
+            "training": {"epochs": 110, "batch_size": 32, "learning_rate": 0.0015},
+            "linear": False,
+        },
         after="large_fresh",
     ),
+    "kept_masks": Plan("masks drawn once", **{**FULL, "kept": "masks"}),
+    "kept_windows": Plan("windows drawn once", **{**FULL, "kept": "windows"}),
+    "thesis_windows": Plan(
+        "windows and masks of the thesis, 30 % alone", **{**FULL, "fractions": ()}
+    ),
+    "no_linear_start": Plan("no linear start", **{**FULL, "linear": False}),
+    "trend": Plan(
+        "trend and gain, no linear start",
+        **{**FULL, "linear": False, "name": "anchored_trend_large"},
+    ),
+    "small_fresh": Plan("small", **{**FULL, "model": SMALL}),
+    "direct_gru": Plan(
+        "residual GRU in place of the ODE",
+        **{**FULL, "linear": False, "model": {}, "name": DIRECT_GRU},
+    ),
 }
+
+ABLATION = (
+    "large_fresh",
+    "kept_masks",
+    "kept_windows",
+    "thesis_windows",
+    "no_linear_start",
+    "trend",
+    "small_fresh",
+    "direct_gru",
+)
+"""The large model, and plans that differ from it in one thing: all of 40 epochs."""
 
 
 def train(
@@ -97,20 +125,40 @@ def train(
     """
     windows, validation, _ = hopper.parts(plan.drawn_for)
     model = ob.make_model(plan.name, windows, scaler=hopper.scaler, seed=seed, **plan.model)
-    redraw, data = None, windows
-    if plan.fractions:
-        redraw = ob.RedrawConfig(plan.fractions, PROTOCOL.window)
-        data = hopper.whole(plan.drawn_for)[0]
+    data, drawn = examples(plan, hopper, windows, seed=seed)
     earlier: tuple[FitResult, ...] = ()
     if plan.after:
         folder = out.parent / f"{plan.after}-seed{seed}"
         before, earlier = train(PLANS[plan.after], hopper, folder, seed=seed)
         model.load_state_dict(before.state_dict())
     elif plan.linear:
-        start_linear(model, data)
-    config = ob.TrainConfig(seed=seed, redraw=redraw, **plan.training)
+        start_linear(model, hopper.whole(plan.drawn_for)[0])
+    config = ob.TrainConfig(seed=seed, redraw=drawn, **plan.training)
     result = ob.fit(model, data, validation, config, out=out, progress=False)
     return model, (*earlier, result)
+
+
+def examples(
+    plan: Plan, hopper: Hopper, windows: ob.Dataset, *, seed: int = 0
+) -> tuple[ob.Dataset, ob.RedrawConfig | None]:
+    """What a plan is trained on, and what of it is drawn anew in each epoch.
+
+    Args:
+        plan: what to train.
+        hopper: the data.
+        windows: the training windows of the thesis.
+        seed: of masks that are drawn once.
+    """
+    if not plan.fractions:
+        return windows, None
+    if plan.kept == "windows":
+        unmasked = tuple(replace(t, observed=None) for t in windows)
+        return ob.Dataset(unmasked, windows.meta), ob.RedrawConfig(plan.fractions)
+    whole = hopper.whole(plan.drawn_for)[0]
+    if plan.kept != "masks":
+        return whole, ob.RedrawConfig(plan.fractions, PROTOCOL.window)
+    drawn = redraw(ob.Batch.of(whole), ob.RedrawConfig(plan.fractions), seed=seed)
+    return drawn.dataset(whole), ob.RedrawConfig((1.0,), PROTOCOL.window)
 
 
 def start_linear(model: ob.Model, train: ob.Dataset) -> None:
