@@ -113,9 +113,9 @@ def test_a_field_that_starts_linear_is_the_map_of_a_linear_system():
 def test_a_training_goes_on_from_the_weights_of_another(tmp_path, monkeypatch, hopper):
     options = {"hidden_size": 2, "field_units": (28,)}
     first = Plan("first", 0.3, (0.3,), options, {"epochs": 1, "learning_rate": 0.01})
-    still = replace(first, training={"epochs": 1, "learning_rate": 1e-12}, after="small_fresh")
-    monkeypatch.setitem(models.PLANS, "small_fresh", first)
-    before, _ = models.train(first, hopper, tmp_path / "small_fresh-seed0")
+    still = replace(first, training={"epochs": 1, "learning_rate": 1e-12}, after="small")
+    monkeypatch.setitem(models.PLANS, "small", first)
+    before, _ = models.train(first, hopper, tmp_path / "small-seed0")
     after, results = models.train(still, hopper, tmp_path / "on")
     assert [len(result.history) for result in results] == [1, 1]
     for name, value in before.state_dict().items():

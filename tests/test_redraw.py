@@ -11,7 +11,7 @@ from task_helpers import SMALL, TRAIN, VALIDATION, same, weights
 import offbeat as ob
 from offbeat.config import RedrawConfig
 from offbeat.data.redraw import redraw
-from offbeat.examples import Examples, RedrawnExamples, TrainingSet, longest_silence
+from offbeat.examples import AHEAD, Examples, RedrawnExamples, TrainingSet, longest_silence
 from offbeat.models.zoo import recipe_of
 
 
@@ -85,9 +85,25 @@ def test_the_loss_is_that_of_the_same_windows_in_memory(name, observed):
     model = ob.make_model(name, data, **SMALL)
     drawn = redraw(model.batch(data), RedrawConfig((0.5,), window=28), seed=5)
     whole = Examples(model, model.batch(drawn.dataset(data)))
-    index = torch.tensor([3, 0, 7, 11])
-    expected = whole.loss(model, index, None)
-    assert torch.equal(RedrawnExamples(drawn).loss(model, index, None), expected)
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+    examples = RedrawnExamples(drawn, order)
+    # In turn, again from the first one, from within (a training that is resumed), out of turn.
+    for index in (order[:3], order[3:5], order[5:], order[:1], order[7:8], order[[2, 9]]):
+        expected = whole.loss(model, index, None)
+        assert torch.equal(examples.loss(model, index, None), expected)
+
+
+def test_inputs_of_a_few_batches_are_computed_together(monkeypatch):
+    data = grid(40, 30)
+    model = ob.make_model("gru", data, **SMALL)
+    drawn, order = redraw(model.batch(data), RedrawConfig((0.5,))), torch.arange(40)
+    asked: list[int] = []
+    prepare = model.prepare
+    monkeypatch.setattr(model, "prepare", lambda batch: asked.append(len(batch)) or prepare(batch))
+    examples = RedrawnExamples(drawn, order)
+    for first in range(0, 40, 4):
+        examples.loss(model, order[first : first + 4], None)
+    assert asked == [4 * AHEAD, 40 - 4 * AHEAD]
 
 
 def test_every_epoch_has_masks_of_its_own_and_the_same_whenever_it_is_asked_for():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 import offbeat as ob
 from offbeat.data.batch import delta
@@ -26,6 +26,9 @@ class DirectGru(nn.Module):
         units: of the recurrent unit.
         read_units: of the hidden layer of the perceptron.
     """
+
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, data: Any, units: int = 192, read_units: int = 256) -> None:
         super().__init__()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
@@ -19,7 +20,7 @@ from offbeat.config import Recipe, RedrawConfig, TaskConfig
 from offbeat.data.batch import Batch
 from offbeat.data.redraw import Redrawn, redraw
 from offbeat.data.tasks import draw_tasks
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.metrics import Scores, ScoreSums
 from offbeat.models.base import BaseModel, of_channels
 from offbeat.parts.heads import Prediction
@@ -38,6 +39,10 @@ HUBER = 3.0
 
 UNITS = ("last_value", "mean", "running_mean", "constant_velocity", "damped_slope")
 """Baselines whose errors are the units of the relative loss, where no others are given."""
+
+AHEAD = 8
+"""Batches whose inputs are computed together, where windows and masks are drawn anew: the work is a
+few array operations, and one at a time pays their start-up and cold caches in each step."""
 
 # Streams of random numbers; those of the epochs are (seed, _EPOCHS, epoch).
 _FITTED, _MEASURED, _VALIDATED, _EPOCHS = range(4)
@@ -191,18 +196,25 @@ class Examples:
         model: its scales and statistics give the step inputs.
         batch: scaled.
         reference: of the relative loss; None for that of the model's head.
+        all_count: whether every value of the batch is known to be a target.
     """
 
     def __init__(
-        self, model: BaseModel, batch: Batch, *, reference: Reference | None = None
+        self,
+        model: BaseModel,
+        batch: Batch,
+        *,
+        reference: Reference | None = None,
+        all_count: bool = False,
     ) -> None:
         with torch.no_grad():
             self.prepared = model.prepare(batch)
         # Without the first row: its prediction is a constant.
         self.targets = batch.values[:, 1:].contiguous()
-        counted = batch.targets[:, 1:]
-        self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
-        self.typical = None
+        self.counted = self.typical = None
+        if reference is not None or not all_count:
+            counted = batch.targets[:, 1:]
+            self.counted = None if bool(counted.all()) else counted.to(self.targets.dtype)
         if reference is not None:
             at = cells(batch, reference.bins)[:, 1:]
             channel = torch.arange(batch.channels, device=at.device)
@@ -238,23 +250,40 @@ class Examples:
 
 
 class RedrawnExamples:
-    """The windows and masks of an epoch; inputs of a batch are computed when it is needed.
+    """The windows and masks of an epoch; their inputs are computed for `AHEAD` batches at a time.
 
     Args:
         drawn: windows and masks.
+        order: (trajectories,) their positions in the order in which the epoch takes them.
         reference: of the relative loss; None for that of the model's head.
     """
 
-    def __init__(self, drawn: Redrawn, *, reference: Reference | None = None) -> None:
-        self._drawn, self._reference = drawn, reference
+    def __init__(
+        self, drawn: Redrawn, order: Tensor, *, reference: Reference | None = None
+    ) -> None:
+        self._drawn, self._order, self._reference = drawn, order, reference
+        self._turn = torch.argsort(order)
+        self._all_count = drawn.whole.complete and EXOGENOUS not in drawn.whole.roles
+        self._some: Examples | None = None
+        self._turns = range(0)
 
     def __len__(self) -> int:
         return len(self._drawn)
 
     def loss(self, model: BaseModel, index: Tensor, generator: torch.Generator | None) -> Tensor:
         """As that of `Examples`."""
-        some = Examples(model, self._drawn.take(index), reference=self._reference)
-        return some.loss(model, torch.arange(len(some)), generator)
+        turn = self._turn[index.cpu()]
+        first, last = int(turn.min()), int(turn.max())
+        if last - first >= len(index):  # not in the order of the epoch
+            return self._examples(model, index).loss(model, torch.arange(len(index)), generator)
+        if self._some is None or first not in self._turns or last not in self._turns:
+            self._turns = range(first, min(first + AHEAD * len(index), len(self)))
+            self._some = self._examples(model, self._order[first : self._turns.stop])
+        return self._some.loss(model, turn - self._turns.start, generator)
+
+    def _examples(self, model: BaseModel, index: Tensor) -> Examples:
+        batch = self._drawn.take(index)
+        return Examples(model, batch, reference=self._reference, all_count=self._all_count)
 
 
 def relative_loss(mean: Tensor, targets: Tensor, typical: Tensor, weights: Tensor | None) -> Tensor:
@@ -273,6 +302,17 @@ def relative_loss(mean: Tensor, targets: Tensor, typical: Tensor, weights: Tenso
     if weights is None:
         return each.mean()
     return (each * weights).sum() / weights.sum().clamp_min(1e-12)
+
+
+def order_of(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
+    """(count,) positions in the order in which an epoch takes them.
+
+    Args:
+        seed: of the training.
+        epoch: counted from 0.
+        count: of trajectories or tasks.
+    """
+    return np.random.default_rng([seed, epoch]).permutation(count)
 
 
 class TrainingSet:
@@ -339,7 +379,8 @@ class TrainingSet:
         seed = [recipe.seed, _EPOCHS, epoch]
         if self._whole is not None and recipe.redraw is not None:
             drawn = redraw(self._whole, recipe.redraw, seed=seed)
-            return RedrawnExamples(drawn, reference=self._reference)
+            order = torch.from_numpy(order_of(recipe.seed, epoch, len(drawn)))
+            return RedrawnExamples(drawn, order, reference=self._reference)
         assert recipe.tasks is not None
         return self._examples(draw_tasks(self._train, recipe.tasks, len(self), seed=seed))
 

@@ -26,6 +26,7 @@ from offbeat.examples import (
     ValidationSet,
     fitted_baselines,
     longest_silence,
+    order_of,
     ordered,
     reference_tasks,
     validate,
@@ -285,7 +286,7 @@ def _epoch(
     folder: Path | None,
     identity: dict[str, Any],
 ) -> None:
-    order = np.random.default_rng([recipe.seed, state.epoch]).permutation(len(examples))
+    order = order_of(recipe.seed, state.epoch, len(examples))
     steps = math.ceil(len(examples) / recipe.batch_size)
     started = time.perf_counter()
     done_before = state.seconds

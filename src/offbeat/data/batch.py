@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,11 @@ class Batch:
             return known
         wanted = [role != EXOGENOUS for role in self.roles]
         return known & torch.tensor(wanted, device=known.device)
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether every value of every row is observed, as in simulated trajectories."""
+        return bool(self.mask.all() and self.valid.all())
 
     def inputs(self, last: Tensor, seen: Tensor) -> Batch:
         """Inputs of a model: actions are moved to the next row.

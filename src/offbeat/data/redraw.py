@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from offbeat.config import RedrawConfig
@@ -51,7 +51,7 @@ class Redrawn:
             return some.view(len(index), len(row), *of.shape[2:])
 
         kept, times = self.mask.index_select(0, index), rows(whole.times)
-        if self._complete:
+        if whole.complete:
             shape = (len(index), len(row), whole.channels)
             mask, known = kept.expand(shape), torch.ones_like(kept[..., :1]).expand(shape)
             valid = known[..., 0]
@@ -59,12 +59,7 @@ class Redrawn:
             mask, known, valid = rows(whole.mask) & kept, rows(whole.known), rows(whole.valid)
         values = rows(whole.values)
         batch = Batch(times - times[:, :1], values, mask, known, valid, whole.roles)
-        return batch if self._complete or bool(valid.all()) else batch.take(slice(None))
-
-    @cached_property
-    def _complete(self) -> bool:
-        """Whether every value of every row is observed, as of simulated trajectories."""
-        return bool(self.whole.mask.all() and self.whole.valid.all())
+        return batch if whole.complete or bool(valid.all()) else batch.take(slice(None))
 
     def dataset(self, dataset: Dataset) -> Dataset:
         """All windows, as trajectories.
@@ -108,13 +103,17 @@ def redraw(whole: Batch, config: RedrawConfig, *, seed: int | Sequence[int] = 0)
     fractions = np.asarray(config.observed_fractions)[
         random.integers(0, len(config.observed_fractions), len(whole))
     ]
-    at = start[:, None] + np.arange(rows)
-    shown = (whole.mask & whole.valid[..., None]).cpu().numpy()
     if config.mask == "rows":
-        seen = np.take_along_axis(shown[..., states].any(axis=2), at, axis=1)
+        seen = np.ones((len(whole), rows), dtype=bool)
+        if not whole.complete:
+            at = start[:, None] + np.arange(rows)
+            seen = np.take_along_axis(_shown(whole)[..., states].any(axis=2), at, axis=1)
         mask = keep_at_random(seen, fractions, random)[..., None]
     else:
-        seen = np.take_along_axis(shown.transpose(0, 2, 1), at[:, None], axis=2)
+        seen = np.ones((len(whole), whole.channels, rows), dtype=bool)
+        if not whole.complete:
+            at = start[:, None] + np.arange(rows)
+            seen = np.take_along_axis(_shown(whole).transpose(0, 2, 1), at[:, None], axis=2)
         mask = keep_at_random(seen, fractions[:, None], random).transpose(0, 2, 1)
     if not states.all():
         mask = mask | ~states
@@ -124,3 +123,9 @@ def redraw(whole: Batch, config: RedrawConfig, *, seed: int | Sequence[int] = 0)
         torch.from_numpy(start).to(device),
         torch.from_numpy(np.ascontiguousarray(mask)).to(device),
     )
+
+
+def _shown(whole: Batch) -> NDArray[np.bool_]:
+    """(trajectories, rows, channels) what is observed of them."""
+    shown: NDArray[np.bool_] = (whole.mask & whole.valid[..., None]).cpu().numpy()
+    return shown

@@ -413,6 +413,10 @@ class Model(BaseModel):
         delta = (at_rows.delta / unit).to(dtype) if spec.decay or spec.input_decay else None
         if spec.input_decay:
             rows = replace(rows, delta=delta, last=last, mean=self.mean)
+        if ended_actions is not None:
+            ended = replace(ended, actions=ended_actions)
+        if not (spec.decay or ends):
+            return rows, ended
         kept = at_rows.observed if spec.nodes else torch.ones_like(update)
         updated = at_last(rows.update, kept, past.updated.to(dtype))
         if spec.decay:
@@ -423,10 +427,7 @@ class Model(BaseModel):
                 decay_start=(start / unit).to(dtype),
                 decay_end=(end / unit).to(dtype),
             )
-        ended = replace(ended, updated=torch.where(kept, rows.update, updated)[:, -1] > 0)
-        if ended_actions is not None:
-            ended = replace(ended, actions=ended_actions)
-        return rows, ended
+        return rows, replace(ended, updated=torch.where(kept, rows.update, updated)[:, -1] > 0)
 
     def _nodes(self, at_rows: ElapsedTimes) -> tuple[Tensor, Tensor, Tensor]:
         """`gap`, `first_node` and `node` of `StepInputs`."""
