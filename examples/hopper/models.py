@@ -27,23 +27,23 @@ class Plan:
         title: in tables.
         drawn_for: fraction whose windows of the thesis give split, scales and validation.
         fractions: that are trained on; empty for the thesis' windows and masks, kept in all epochs.
-        kept: `windows` or `masks`, which are then drawn once; "" for both anew in each epoch.
         model: fields of `ModelConfig`.
         training: fields of `TrainConfig`.
         linear: whether the vector field starts as the linear model of one step.
         after: another plan, whose trained weights are the initial ones; "" for none.
         name: entry of the zoo.
+        kept: `windows` or `masks`, which are then drawn once; "" for both anew in each epoch.
     """
 
     title: str
     drawn_for: float
     fractions: tuple[float, ...]
-    kept: str = ""
     model: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     linear: bool = False
     after: str = ""
     name: str = "anchored_ode_gru_d"
+    kept: str = ""
 
 
 SMALL = {"hidden_size": 32, "field_units": (100, 100, 100)}
