@@ -24,6 +24,11 @@ def test_an_unchanged_file_is_read(name, tmp_path, monkeypatch):
     assert [said for _, said in fuzz.outcomes(name, range(3), good)] == ["read"] * 3
 
 
+@pytest.mark.parametrize(("name", "number"), [("lerobot v3.0", 402), ("lerobot v3.0", 1035)])
+def test_mutants_that_once_ended_in_a_fault(name, number, tmp_path):
+    assert fuzz.outcome(name, number, fuzz.prepared(name, tmp_path / "good")) == "refused"
+
+
 def test_a_fault_is_found(tmp_path, monkeypatch):
     """The outcome of a reader that raises, hangs, or prints control characters names the fault."""
     good = fuzz.prepared("csv", tmp_path / "good")

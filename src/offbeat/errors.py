@@ -9,7 +9,7 @@ import itertools
 import math
 import os
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from types import ModuleType
 
 
@@ -106,6 +106,28 @@ def one_of(what: str, got: str, choices: Iterable[str], *, whole: bool = False) 
     more = f" and {len(known) - listed} more" if listed < len(known) else ""
     shown = ", ".join(known[:listed]) + more
     raise InputError(f"unknown {what} {given}, expected one of: {shown}{hint}")
+
+
+def listed(names: Sequence[str], most: int = 20, *, quoted: bool = True) -> str:
+    """Names that a file holds, for messages.
+
+    Of many or long names, the first ones are given, and the number of the rest.
+
+    Args:
+        names: to list.
+        most: of them that are given.
+        quoted: put each of them in quotes.
+    """
+    shown = [f"{name[:36]}..." if len(name) > 40 else name for name in names[:most]]
+    shown = [repr(name) if quoted else repr(name)[1:-1] for name in shown]
+    lengths = itertools.accumulate(len(name) + 2 for name in shown)
+    fit = max(sum(1 for _ in itertools.takewhile(lambda n: n <= _LONGEST_LIST, lengths)), 1)
+    more = f" and {len(names) - fit} more" if len(names) > fit else ""
+    return ", ".join(shown[:fit]) + more
+
+
+_LONGEST_LIST = 160
+"""Characters of names in a message."""
 
 
 def of_system(error: OSError) -> str:

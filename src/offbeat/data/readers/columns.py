@@ -6,7 +6,6 @@ channel, value), and holds one recording or, by a column of labels, several.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from offbeat.data.cleaning.clocks import (
 from offbeat.data.cleaning.options import is_number
 from offbeat.data.readers.options import names as names_of
 from offbeat.data.readers.stamps import form_of
-from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.errors import FileFormatError, InputError, listed, one_of
 
 LABEL_NAMES = ("trajectory", "episode", "episode_index", "demo")
 """Names of trajectory columns, in any case."""
@@ -463,19 +462,3 @@ def _instance_column(
             if few and shared and len(stamps) == len(pairs) == len(numbers):
                 return name
     return None
-
-
-def listed(names: Sequence[str], most: int = 20) -> str:
-    """Names in quotes, for messages.
-
-    Of many or long names, the first ones are given, and the number of the rest.
-    """
-    shown = [f"{name[:36]}..." if len(name) > 40 else name for name in names[:most]]
-    lengths = itertools.accumulate(len(repr(name)) + 2 for name in shown)
-    fit = max(sum(1 for _ in itertools.takewhile(lambda n: n <= _LONGEST_LIST, lengths)), 1)
-    more = f" and {len(names) - fit} more" if len(names) > fit else ""
-    return ", ".join(map(repr, shown[:fit])) + more
-
-
-_LONGEST_LIST = 160
-"""Characters of names in a message."""

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER, time_column_of
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullValueError, gather, line_error, with_joined
-from offbeat.data.readers.columns import Columns, listed
+from offbeat.data.readers.columns import Columns
 from offbeat.data.readers.csv_fields import BOOLEANS, GROUPED_BY_POINTS, Converter, number_in
 from offbeat.data.readers.csv_layout import CsvLayout, is_comment
 from offbeat.data.readers.csv_streams import Spaced, Without, with_count, with_dates
 from offbeat.data.readers.gathered import Coded, Gathered
 from offbeat.data.readers.stamps import expected_after, form_of, over_midnight, with_stamps
 from offbeat.data.readers.text import DAMAGE, TextFile, no_text
-from offbeat.errors import FileFormatError, InputError
+from offbeat.errors import FileFormatError, InputError, listed
 
 _COMMA = re.compile(r"[+-]?\d+,\d+")
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")

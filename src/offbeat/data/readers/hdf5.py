@@ -36,11 +36,11 @@ from offbeat.data.cleaning.clocks import (
 )
 from offbeat.data.cleaning.options import is_number
 from offbeat.data.memory import require_memory
-from offbeat.data.readers.columns import columns_in, listed
+from offbeat.data.readers.columns import columns_in
 from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file, starts_with
-from offbeat.errors import FileFormatError, InputError, OffbeatError, one_of, require
+from offbeat.errors import FileFormatError, InputError, OffbeatError, listed, one_of, require
 
 SUFFIXES = (".hdf5", ".h5", ".hdf")
 
@@ -121,7 +121,8 @@ def recordings(
         if not episodes:
             raise FileFormatError(
                 f"{path} is laid out neither like robomimic (data/demo_0/obs) nor like Minari "
-                f"(episode_0/observations); it holds: {', '.join(sorted(file)) or 'nothing'}"
+                "(episode_0/observations); it holds: "
+                f"{listed(sorted(file), quoted=False) or 'nothing'}"
             )
         if mask is not None:
             episodes = _masked(file, mask, episodes, path)
@@ -282,13 +283,13 @@ def _episode(
     if not arrays:
         raise FileFormatError(
             f"{path}: {episode.name} holds no observations that are numbers; it has: "
-            f"{', '.join(leaves) or 'none'}"
+            f"{listed(list(leaves), quoted=False) or 'none'}"
         )
     rows = {name: len(values) for name, values in arrays.items()}
     if len(set(rows.values())) > 1 or (clock and len(clock[1]) not in rows.values()):
         raise FileFormatError(
             f"{path}: observations of {episode.name} differ in their rows: "
-            + ", ".join(f"{name} {n}" for name, n in rows.items())
+            + listed([f"{name} {n}" for name, n in rows.items()], quoted=False)
         )
     n = next(iter(rows.values()))
     label = episode.name.rpartition("/")[2]
@@ -382,7 +383,7 @@ def _times(
         name = time_column_of(usual) or ""
         together = [pair for pair in pairs if name in pair or not name]
         if len(together) > 1:
-            shown = ", ".join(f"[{one}, {two}]" for one, two in together[:3])
+            shown = listed([f"[{one}, {two}]" for one, two in together], 3, quoted=False)
             raise FileFormatError(
                 f"{path} has several stamps, each in two arrays: {shown}; say which one is the "
                 "time with time_column="

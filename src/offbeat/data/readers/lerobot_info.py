@@ -12,10 +12,9 @@ from typing import Any
 
 from offbeat.data.cleaning.clocks import split_stamps, time_column_of
 from offbeat.data.readers.columns import columns_in
-from offbeat.data.readers.columns import listed as quoted
 from offbeat.data.readers.options import names
 from offbeat.data.source import inside, read_json, require_file
-from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.errors import FileFormatError, InputError, listed, one_of
 
 WIDEST = 1024
 """Features with at least this many numbers per row are treated as images and left out."""
@@ -132,11 +131,11 @@ class Info:
 
     def chosen(self, columns: Sequence[str] | None) -> tuple[list[Feature], list[str]]:
         """The features that become channels, and notes on the others."""
-        listed = names("columns", columns)
-        if listed is not None:
-            for name in listed:
+        wanted = names("columns", columns)
+        if wanted is not None:
+            for name in wanted:
                 one_of("column", name, [f.name for f in self.features.values() if f.is_number])
-            return [self.features[name] for name in listed], []
+            return [self.features[name] for name in wanted], []
         chosen, left = [], []
         for feature in self.features.values():
             if feature.name in _BOOKKEEPING or feature.role == "action":
@@ -151,7 +150,7 @@ class Info:
         if not chosen:
             raise FileFormatError(
                 f"{self.root} has no features that are numbers but actions and bookkeeping; "
-                f"choose with columns= from: {quoted(list(self.features), 12)}"
+                f"choose with columns= from: {listed(list(self.features), 12)}"
             )
         return chosen, [f"left out unless chosen with columns=: {', '.join(left)}"] if left else []
 
@@ -170,7 +169,7 @@ class Info:
             if len(parts) != 1 and parts not in pairs:
                 raise InputError(
                     f"{self.root}: time_column must name one column, or two with whole seconds and "
-                    f"what is left of each in ns, us or ms, got {quoted(parts)}"
+                    f"what is left of each in ns, us or ms, got {listed(parts)}"
                 )
             return [parts]
         named = [(f.name,) for f in self.features.values() if f.is_time]
@@ -179,8 +178,8 @@ class Info:
         if len(pairs) > 1 and not measured:
             raise FileFormatError(
                 f"{self.root} has several stamps, each in two columns: "
-                f"{', '.join(f'[{one}, {two}]' for one, two in pairs[:3])}; say which one is the "
-                "time with time_column="
+                f"{listed([f'[{one}, {two}]' for one, two in pairs], 3, quoted=False)}; say which "
+                "one is the time with time_column="
             )
         # measured stamps take precedence over LeRobot's
         return [*measured, *pairs[:1], *(clock for clock in single if clock not in measured)]
@@ -307,8 +306,8 @@ def read_columns(path: Path, columns: list[str]) -> Any:
             missing = [name for name in columns if name not in file.schema_arrow.names]
             if missing:
                 raise FileFormatError(
-                    f"{path} has no column {missing[0]!r}, expected as meta/info.json says; it "
-                    f"has: {', '.join(file.schema_arrow.names)}"
+                    f"{path} has no column {listed(missing, 1)}, expected as meta/info.json says; "
+                    f"it has: {listed(file.schema_arrow.names, quoted=False)}"
                 )
             return file.read(columns=columns)
     except FileFormatError:

@@ -20,7 +20,7 @@ from offbeat.data.readers.stamps import date_and_time, form_of, over_midnight, s
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, one_of
+from offbeat.errors import FileFormatError, listed, one_of
 
 _NAMES = ("names", "channels", "columns")
 _SPECIAL = (*_NAMES, "units")
@@ -101,8 +101,8 @@ def read_npz(
     table, stated, left = _table(rest, shape, {stamp.time, stamp.rest})
     left += beside
     if not any(array.dtype.kind in "biuf" for array in table.values()):
-        shapes = ", ".join(f"{name!r} {array.shape}" for name, array in arrays.items()
-                           if name != stamp.time) or "nothing"  # fmt: skip
+        others = [f"{name} {array.shape}" for name, array in arrays.items() if name != stamp.time]
+        shapes = listed(others, quoted=False) or "nothing"
         raise FileFormatError(
             f"{path} has no array with a row for each of the {shape} times in {stamp.time!r}, "
             f"besides them it has {shapes}"

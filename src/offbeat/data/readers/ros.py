@@ -16,7 +16,7 @@ from offbeat.data.readers.ros_files import Bag, Connection, explained, open_bag
 from offbeat.data.readers.ros_topic import Topic
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file, starts_with
-from offbeat.errors import FileFormatError, one_of, require
+from offbeat.errors import FileFormatError, listed, one_of, require
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 
@@ -110,16 +110,17 @@ def recordings(
     for topic in readers.values():
         signals.extend(topic.signals(header=clocks[topic.name], notes=notes))
     if not signals:
+        topics = listed(list(readers), 4, quoted=False) or "any of its topics"
         raise FileFormatError(
-            f"{path} holds no numbers in {', '.join(readers) or 'any of its topics'}; it has the "
-            f"topics {_listed(bag.connections)}; choose with topics="
+            f"{path} holds no numbers in {topics}; it has the topics "
+            f"{_listed(bag.connections)}; choose with topics="
         )
     yield Recording(tuple(signals), origin=path.name, time_unit="ns", notes=tuple(notes))
 
 
 def _listed(connections: Sequence[Connection]) -> str:
     topics = {c.topic: f"{c.topic} ({c.kind})" for c in connections}
-    return ", ".join(topics[name] for name in sorted(topics)) or "none"
+    return listed([topics[name] for name in sorted(topics)], quoted=False) or "none"
 
 
 def _chosen(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from offbeat.data.readers.options import Fields, below, names
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, one_of, require
+from offbeat.errors import FileFormatError, listed, one_of, require
 
 SUFFIXES = (".ulg", ".ulog")
 
@@ -84,8 +84,8 @@ def recordings(
     """
     require("pyulog", "px4")
     path = require_file(path)
-    listed = names("topics", topics)
-    asked = None if listed is None else dict(_instance(topic) for topic in listed)
+    named = names("topics", topics)
+    asked = None if named is None else dict(_instance(topic) for topic in named)
     wanted = _Wanted(DEFAULTS if asked is None else asked)
     log, notes = _parsed(path, wanted)
     there: dict[str, list[Any]] = {}
@@ -97,7 +97,8 @@ def recordings(
         if not chosen:
             raise FileFormatError(
                 f"{path} holds none of the topics that are read by default "
-                f"({', '.join(DEFAULTS)}); choose with topics= from: {', '.join(left) or 'none'}"
+                f"({', '.join(DEFAULTS)}); choose with topics= from: "
+                f"{listed(left, quoted=False) or 'none'}"
             )
         if left:
             more = f" and {len(left) - 8} more" if len(left) > 8 else ""
@@ -121,7 +122,7 @@ def recordings(
     pick.check()
     if not signals:
         raise FileFormatError(
-            f"{path} holds no numbers in {', '.join(chosen)}; choose with topics="
+            f"{path} holds no numbers in {listed(list(chosen), quoted=False)}; choose with topics="
         )
     yield Recording(tuple(signals), origin=path.name, time_unit="us", notes=tuple(notes))
 
