@@ -272,5 +272,6 @@ def test_several_stamps_in_two_columns_are_refused_by_name(write):
     root = write(both, features=logs.FEATURES | more | again)
     refused(root, r"has several stamps, each in two columns: \[a_sec, a_nanosec\], \[b_sec")
     dataset = read(root, time_column=["b_sec", "b_nanosec"])
+    assert dataset.names == ("hip", "knee", "ankle", "action.left", "action.right")
     assert np.array_equal(np.rint(dataset[1].times * 1e9), NS[1] - NS[1][0])
     refused(root, "must name one column, or two", InputError, time_column=["a_sec", "b_sec"])

@@ -117,6 +117,11 @@ KINDS: dict[str, Kind] = {
     "a stamp in seconds and microseconds": Kind(
         {"stamp/sec": SEC, "stamp/usec": REST // 1000, **XY}, XY
     ),
+    "a stamp in two columns beside the time": Kind(
+        {"rosbagTimestamp": NS + 7, "secs": SEC, "nsecs": REST, **XY},
+        XY,
+        note="further stamps are left out: 'secs', 'nsecs'",
+    ),
     "a stamp in two columns of floats": Kind(
         {"sec": SEC.astype(float), "nanosec": REST.astype(float), **XY}, XY
     ),

@@ -6,6 +6,7 @@ channel, value), and holds one recording or, by a column of labels, several.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -211,12 +212,23 @@ class Columns:
             without = {column_of[name] for name in options.without if name in column_of}
             beside = _of_answers(columns)
             texts = [c for c in columns if c not in without | beside and sample.is_text(c)]
-            left = [*without, *beside, *texts]
+            stamps = [
+                pair
+                for *pair, unit in split_stamps(columns)
+                if is_rest(sample.numbers(pair[0]), sample.numbers(pair[1]), unit)
+            ]
+            left = list(dict.fromkeys([*without, *beside, *texts, *itertools.chain(*stamps)]))
             gone = set(left)
             kept = [column for column in columns if column not in gone]
             if beside:
                 notes = (
                     "masks and intervals of answers are left out unless chosen with channels=",
+                )
+            if stamps:
+                notes = (
+                    *notes,
+                    f"columns of further stamps are left out: {listed([*itertools.chain(*stamps)])}"
+                    "; time_column= takes two of them as the time",
                 )
             if texts:
                 notes = (

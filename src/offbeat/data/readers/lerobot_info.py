@@ -137,10 +137,11 @@ class Info:
                 one_of("column", name, [f.name for f in self.features.values() if f.is_number])
             return [self.features[name] for name in wanted], []
         chosen, left = [], []
+        stamps = {name for pair in self._pairs() for name in pair}
         for feature in self.features.values():
             if feature.name in _BOOKKEEPING or feature.role == "action":
                 continue
-            if feature.name.startswith(_BESIDE):
+            if feature.name.startswith(_BESIDE) or feature.name in stamps:
                 left.append(feature.name)
             elif feature.is_number and 0 < feature.width <= WIDEST and len(feature.shape) < 3:
                 if not feature.is_time:
