@@ -296,6 +296,9 @@ class RedrawConfig:
 LOSSES = ("head", "relative")
 """Losses of `TrainConfig.loss`."""
 
+PRECISIONS = ("float32", "tf32", "bf16")
+"""Precisions of the products of a training step, see `TrainConfig.precision`."""
+
 
 @dataclass(frozen=True)
 class TaskConfig:
@@ -364,6 +367,9 @@ class TrainConfig:
             those of the best baseline for the channel and the time since its last observation.
             With it, or with tasks, `patience` and `keep` go by the validation score, the mean
             logarithm of the ratio of the MSE to that of the best baseline.
+        precision: of the products of a step on a GPU. `float32` is that of IEEE; `tf32` rounds
+            what is multiplied to 10 bits; `bf16` computes them in bfloat16 (autocast). Weights,
+            the optimizer, times and the validation stay as they are.
     """
 
     epochs: int | None = None
@@ -381,6 +387,7 @@ class TrainConfig:
     tasks_per_epoch: int | None = None
     redraw: RedrawConfig | None = None
     loss: Literal["head", "relative"] | None = None
+    precision: Literal["float32", "tf32", "bf16"] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.tasks, dict):  # from JSON and YAML
@@ -396,6 +403,7 @@ class TrainConfig:
             ("schedule", ("constant", "cosine")),
             ("keep", ("last", "best")),
             ("loss", LOSSES),
+            ("precision", PRECISIONS),
         ):
             if getattr(self, name) is not None:
                 one_of(f"value of {name}", getattr(self, name), choices)
@@ -427,6 +435,7 @@ class Recipe:
         tasks_per_epoch: number of tasks.
         redraw: how windows and masks are drawn; None keeps those of the training set.
         loss: `head` or `relative`.
+        precision: of the products of a step on a GPU.
     """
 
     epochs: int
@@ -444,6 +453,7 @@ class Recipe:
     tasks_per_epoch: int = 1024
     redraw: RedrawConfig | None = None
     loss: str = "head"
+    precision: str = "float32"
 
     @property
     def relative(self) -> bool:

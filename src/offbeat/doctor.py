@@ -42,6 +42,7 @@ def examine() -> dict[str, Any]:
         else os.cpu_count(),
         "torch threads": torch.get_num_threads(),
         "torch CUDA": torch.cuda.is_available(),
+        "device auto": _device(),
         "scan backend": _scan_backend(),
         "instruction sets": ", ".join(cpu.instruction_sets()) or f"none: {cpu.why_not}",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
@@ -80,6 +81,12 @@ def _scan_backend() -> str:
     except InputError as error:
         return f"none: {error}"
     return f"{name} ({why})"
+
+
+def _device() -> str:
+    from offbeat.devices import examined
+
+    return examined()
 
 
 def _version(name: str) -> str | None:

@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from offbeat.answers.scoring import ChannelScores
 from offbeat.data.batch import last_index
 from offbeat.data.trajectory import Dataset
+from offbeat.devices import placed
 from offbeat.errors import InputError
 from offbeat.metrics import Scores, ScoreSums, last_value_predictions, table
 from offbeat.models.base import BaseModel
@@ -81,7 +84,11 @@ class Evaluation:
 
 
 def evaluate(
-    models: BaseModel | Mapping[str, BaseModel], dataset: Dataset, *, seed: int = 0
+    models: BaseModel | Mapping[str, BaseModel],
+    dataset: Dataset,
+    *,
+    seed: int = 0,
+    device: str | torch.device | None = None,
 ) -> Evaluation:
     """Scores one-step-ahead predictions of one or more models, and of the last observed value.
 
@@ -89,6 +96,8 @@ def evaluate(
         models: one model, or several by name; several must have the same scaler and training means.
         dataset: masked values that are known are scored too.
         seed: of self-feeding.
+        device: that the models are computed on, as of `fit`, and moved back from; by default their
+            own.
 
     Raises:
         InputError: the data has other channels than a model, or models score in other units.
@@ -113,7 +122,10 @@ def evaluate(
     counted = batch.targets & (last_index(batch.mask) >= 0)
     trivial = ScoreSums(batch.channels, gap_unit=first.statistics.median_gap)
     trivial.add(last_value_predictions(batch, first.mean), batch)
-    scores = {name: validate(model, batch, seed=seed) for name, model in models.items()}
+    scores = {}
+    for name, model in models.items():
+        with placed(model, device, batch=min(500, len(batch))):
+            scores[name] = validate(model, batch.to(model.device), seed=seed)
     return Evaluation(
         {**scores, LAST_VALUE: trivial.scores()},
         first.names,

@@ -21,8 +21,10 @@ from offbeat.data.batch import Batch
 from offbeat.data.redraw import Redrawn, redraw
 from offbeat.data.tasks import draw_tasks
 from offbeat.data.trajectory import EXOGENOUS, Dataset
+from offbeat.kernels import StepTable
 from offbeat.metrics import Scores, ScoreSums
 from offbeat.models.base import BaseModel, of_channels
+from offbeat.models.corrected import CorrectedInputs
 from offbeat.parts.heads import Prediction
 
 REFERENCE_TASKS = 600
@@ -224,16 +226,35 @@ class Examples:
     def __len__(self) -> int:
         return len(self.prepared)
 
-    def loss(self, model: BaseModel, index: Tensor, generator: torch.Generator | None) -> Tensor:
+    def loss(
+        self,
+        model: BaseModel,
+        index: Tensor,
+        generator: torch.Generator | None,
+        *,
+        host: Tensor | None = None,
+        whole: bool = False,
+    ) -> Tensor:
         """The model's loss of the one-step-ahead prediction of some trajectories.
 
         Args:
             model: in its current state.
             index: (batch,) positions of the trajectories.
             generator: of self-feeding.
+            host: `index` on the CPU, where it lies on the device: then nothing waits for that.
+            whole: do not trim to the longest of them, so that shapes are those of any other batch.
         """
+        taken: Any
+        if whole:
+            taken = self.prepared.take_whole(index)  # type: ignore[attr-defined]
+        elif host is not None and isinstance(self.prepared, StepTable | Batch | CorrectedInputs):
+            taken = self.prepared.take(index, host=host)
+        else:
+            taken = self.prepared.take(index)
+        return self._loss(model, model.run(taken, generator=generator), index)
+
+    def _loss(self, model: BaseModel, whole: Prediction, index: Tensor) -> Tensor:
         index = index.to(self.targets.device)
-        whole = model.run(self.prepared.take(index), generator=generator)
         scale = None if whole.scale is None else whole.scale[:, 1:]
         prediction = Prediction(whole.mean[:, 1:], scale)
         rows = prediction.mean.shape[1]
@@ -284,6 +305,14 @@ class RedrawnExamples:
     def _examples(self, model: BaseModel, index: Tensor) -> Examples:
         batch = self._drawn.take(index)
         return Examples(model, batch, reference=self._reference, all_count=self._all_count)
+
+    def prepared(self, model: BaseModel) -> Examples:
+        """The same with the inputs of all windows, for a device with the memory for them.
+
+        Args:
+            model: its scales and statistics give the step inputs.
+        """
+        return self._examples(model, torch.arange(len(self)))
 
 
 def relative_loss(mean: Tensor, targets: Tensor, typical: Tensor, weights: Tensor | None) -> Tensor:
@@ -380,7 +409,9 @@ class TrainingSet:
         if self._whole is not None and recipe.redraw is not None:
             drawn = redraw(self._whole, recipe.redraw, seed=seed)
             order = torch.from_numpy(order_of(recipe.seed, epoch, len(drawn)))
-            return RedrawnExamples(drawn, order, reference=self._reference)
+            examples = RedrawnExamples(drawn, order, reference=self._reference)
+            # Elsewhere a step must not wait for the CPU, which inputs of a batch would make it do.
+            return examples if self._model.device.type == "cpu" else examples.prepared(self._model)
         assert recipe.tasks is not None
         return self._examples(draw_tasks(self._train, recipe.tasks, len(self), seed=seed))
 

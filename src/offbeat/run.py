@@ -130,6 +130,23 @@ class RunState:
         self.diverged = ""  # what happened, where a training ended so
         self.best: dict[str, Tensor] = {}
 
+    def set_rate(self, rate: float) -> None:
+        """Sets the learning rate of the steps that follow."""
+        for group in self.optimizer.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+
+    def forget_moments(self) -> None:
+        """Resets the optimizer; a graph keeps the tensors, so they stay where they are."""
+        if self.parameters.flat.device.type == "cpu":
+            self.optimizer.state.clear()
+            return
+        with torch.no_grad():
+            for value in self.optimizer.state.get(self.parameters.flat, {}).values():
+                value.zero_()
+
 
 def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimizer:
     kinds: dict[str, Any] = {
@@ -138,9 +155,13 @@ def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimize
         "adamw": torch.optim.AdamW,
         "sgd": torch.optim.SGD,
     }
-    optimizer: torch.optim.Optimizer = kinds[recipe.optimizer](
-        [flat], lr=recipe.learning_rate, foreach=True
-    )
+    options: dict[str, Any] = {"lr": recipe.learning_rate, "foreach": True}
+    if flat.device.type != "cpu" and recipe.optimizer != "sgd":
+        # The count of steps and the rate lie on the device, so that a graph can hold the step.
+        options["capturable"] = flat.device.type == "cuda"
+    if flat.device.type == "cuda":
+        options["lr"] = torch.tensor(recipe.learning_rate, device=flat.device)
+    optimizer: torch.optim.Optimizer = kinds[recipe.optimizer]([flat], **options)
     return optimizer
 
 
@@ -365,8 +386,8 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
     prefix = "optimizer."
     device = state.parameters.flat.device
     moments = {
-        # A count of steps, which has no axes, stays with the optimizer's numbers.
-        k[len(prefix) :]: v.to(device) if v.ndim else v
+        # A count of steps, which has no axes, stays with the optimizer's numbers on the CPU.
+        k[len(prefix) :]: v.to(device) if v.ndim or device.type == "cuda" else v
         for k, v in tensors.items()
         if k.startswith(prefix)
     }

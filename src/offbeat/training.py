@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from offbeat.baselines import Baseline
+from offbeat.captured import CapturedStep, autocast, captured, check_precision, products
 from offbeat.config import Recipe, TrainConfig
 from offbeat.data.trajectory import Dataset
+from offbeat.devices import resolved
 from offbeat.errors import DivergenceError, InputError
 from offbeat.examples import (
     Examples,
@@ -48,6 +51,9 @@ from offbeat.run import (
 )
 
 __all__ = ["Callback", "Examples", "FitResult", "ValidationSet", "fit", "train_step", "validate"]
+
+READ_EVERY = 10
+"""Steps after which losses of another device than the CPU are read, and the progress is shown."""
 
 Callback = Callable[[EpochRecord, BaseModel], bool | None]
 """Called after each epoch; a true result stops the training."""
@@ -120,7 +126,9 @@ def fit(
             is resumed, and ends bit for bit as if it had not been stopped.
         baselines: causal ones, fitted to training data; the best of their errors are the units of
             the relative loss and score. By default those of `examples.UNITS` are fitted to tasks.
-        device: such as `cpu` or `cuda`; by default that of the model. The model stays on it.
+        device: `cpu`, `cuda`, `cuda:1`, or `auto` for a GPU where the model and its batches gain
+            from it (see `offbeat.devices.preferred`); by default that of the model. The model
+            stays on it.
         callbacks: each is called with the record of an epoch and the model after that epoch; a true
             result stops the training.
         progress: show a progress bar.
@@ -141,7 +149,8 @@ def fit(
         raise InputError("patience and keep='best' need a validation set; got none")
     folder = writable(out, folder=True) if out is not None else None
     if device is not None:
-        model.to(_device(device))
+        size = recipe_of(model.name, asked, validated=validation is not None).batch_size
+        model.to(resolved(device, model, batch=size))
     if asked.tasks is not None:
         model.expect_silences(asked.tasks.horizon_s)
     trained_on = ordered(model, train)
@@ -158,6 +167,7 @@ def fit(
         own = ordered(model, validation)
         validated = ValidationSet.of(model, own, recipe, reference=reference)
     counts = validated is not None and validated.counted > 0
+    check_precision(model, asked.precision or "float32")
     recipe = recipe_of(model.name, asked, validated=counts)
     if not counts and (recipe.patience is not None or recipe.keep == "best"):
         if validation is None:
@@ -195,16 +205,6 @@ def fit(
         return _fit(model, examples, validated, *run)
 
 
-def _device(name: str | torch.device) -> torch.device:
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"there is no device {name!r}; give cpu, cuda or cuda:1") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"there is no device {name!r} here: torch finds no CUDA; give cpu")
-    return device
-
-
 def _fit(
     model: BaseModel,
     training_set: TrainingSet,
@@ -222,7 +222,8 @@ def _fit(
         while state.epoch < recipe.epochs and not stopped:
             try:
                 examples = training_set.epoch(state.epoch)
-                _epoch(model, examples, state, recipe, bar, folder, identity)
+                with products(model, recipe.precision):
+                    _epoch(model, examples, state, recipe, bar, folder, identity)
                 _close_epoch(model, validated, state, recipe)
             except DivergenceError as error:
                 stopped = _recover(model, state, recipe, error)
@@ -260,7 +261,7 @@ def _recover(model: BaseModel, state: RunState, recipe: Recipe, error: Divergenc
     if not state.best:
         raise error
     model.load_state_dict(state.best)
-    state.optimizer.state.clear()
+    state.forget_moments()
     state.total_steps -= state.step
     state.step, state.loss_sum, state.seconds = 0, 0.0, 0.0
     if state.rate_factor < 1:
@@ -288,21 +289,27 @@ def _epoch(
 ) -> None:
     order = order_of(recipe.seed, state.epoch, len(examples))
     steps = math.ceil(len(examples) / recipe.batch_size)
+    losses = _Losses(state)
+    elsewhere = _Elsewhere(model, examples, state, recipe, order, steps)
     started = time.perf_counter()
     done_before = state.seconds
     while state.step < steps:
         first = state.step * recipe.batch_size
-        index = torch.from_numpy(order[first : first + recipe.batch_size])
-        loss = train_step(model, examples, index, state, recipe, total=steps * recipe.epochs)
-        state.loss_sum += loss
+        if elsewhere.used:
+            losses.add(elsewhere.step(first))
+        else:
+            index = torch.from_numpy(order[first : first + recipe.batch_size])
+            loss = train_step(model, examples, index, state, recipe, total=steps * recipe.epochs)
+            state.loss_sum += loss
         state.step += 1
         state.total_steps += 1
         state.seconds = done_before + time.perf_counter() - started
         bar.update()
-        if state.step % 10 == 0:
+        due = recipe.checkpoint_every and state.step % recipe.checkpoint_every == 0
+        if state.step % READ_EVERY == 0 or state.step == steps or due:
+            losses.read()
             mean = state.loss_sum / state.step
             bar.set_description(f"epoch {state.epoch + 1}/{recipe.epochs} loss {mean:.3g}")
-        due = recipe.checkpoint_every and state.step % recipe.checkpoint_every == 0
         if folder and due and state.step < steps:
             _check_weights(model, state)
             save_run(folder, model, state, identity)
@@ -331,30 +338,124 @@ def train_step(
     Raises:
         DivergenceError: the loss is not finite.
     """
-    generator = None
-    if model.needs_generator:
-        seed = np.random.default_rng([recipe.seed, state.epoch, state.step]).integers(2**62)
-        generator = torch.Generator().manual_seed(int(seed))
-    loss = examples.loss(model, index, generator)
+    with autocast(model, recipe.precision):
+        loss = examples.loss(model, index, _generator(model, state, recipe))
     value = float(loss.detach())
+    _check_loss(value, state.epoch, state.step)
+    _set_rate(state, recipe, total)
+    _descend(loss, state, recipe)
+    return value
+
+
+def _generator(model: BaseModel, state: RunState, recipe: Recipe) -> torch.Generator | None:
+    """The generator of a step, on the CPU on every device, so that its numbers are the same."""
+    if not model.needs_generator:
+        return None
+    seed = np.random.default_rng([recipe.seed, state.epoch, state.step]).integers(2**62)
+    return torch.Generator().manual_seed(int(seed))
+
+
+def _check_loss(value: float, epoch: int, step: int) -> None:
     if not math.isfinite(value):
         raise DivergenceError(
-            f"the loss is {value} in epoch {state.epoch + 1}, step {state.step + 1}; the "
+            f"the loss is {value} in epoch {epoch + 1}, step {step + 1}; the "
             "last good checkpoint is kept: lower the learning rate, or clip gradients (clip_norm)"
         )
+
+
+def _set_rate(state: RunState, recipe: Recipe, total: int) -> None:
+    """Sets the learning rate of the next step."""
+    if recipe.schedule == "cosine":
+        rate = 0.5 * recipe.learning_rate * (1 + math.cos(math.pi * state.total_steps / total))
+        state.set_rate(state.rate_factor * rate)
+    elif state.rate_factor < 1:
+        state.set_rate(state.rate_factor * recipe.learning_rate)
+
+
+def _descend(loss: Tensor, state: RunState, recipe: Recipe) -> None:
+    """Backward pass, clipping and the step of the optimizer."""
     state.parameters.zero_gradient()
     (loss * recipe.loss_scale).backward()  # type: ignore[no-untyped-call]
     if recipe.clip_norm is not None:
         torch.nn.utils.clip_grad_norm_([state.parameters.flat], recipe.clip_norm)
-    if recipe.schedule == "cosine":
-        rate = 0.5 * recipe.learning_rate * (1 + math.cos(math.pi * state.total_steps / total))
-        for group in state.optimizer.param_groups:
-            group["lr"] = state.rate_factor * rate
-    elif state.rate_factor < 1:
-        for group in state.optimizer.param_groups:
-            group["lr"] = state.rate_factor * recipe.learning_rate
     state.optimizer.step()
-    return value
+
+
+class _Losses:
+    """Losses of steps that lie on another device: read together, so that steps don't wait.
+
+    A loss that is not finite is found when it is read; the weights are those of later steps then.
+    """
+
+    def __init__(self, state: RunState) -> None:
+        self._state, self._open = state, list[Tensor]()
+
+    def add(self, loss: Tensor) -> None:
+        """Takes the loss of a step."""
+        self._open.append(loss)
+
+    def read(self) -> None:
+        """Reads the open losses and adds them to the sum of the epoch.
+
+        Raises:
+            DivergenceError: one is not finite.
+        """
+        if not self._open:
+            return
+        values = torch.stack(self._open).double().tolist()
+        self._open.clear()
+        for i, value in enumerate(values):
+            _check_loss(value, self._state.epoch, self._state.step - len(values) + i)
+            self._state.loss_sum += value
+
+
+class _Elsewhere:
+    """The steps of an epoch on another device than the CPU: no transfer and no wait within a step.
+
+    The order of the trajectories, the same as on the CPU, is sent there once.
+    """
+
+    def __init__(
+        self,
+        model: BaseModel,
+        examples: Examples | RedrawnExamples,
+        state: RunState,
+        recipe: Recipe,
+        order: NDArray[np.int64],
+        steps: int,
+    ) -> None:
+        self.used = model.device.type != "cpu" and isinstance(examples, Examples)
+        self._model, self._examples, self._state = model, examples, state
+        self._recipe, self._total = recipe, steps * recipe.epochs
+        self._captured: CapturedStep | None = None
+        if not self.used:
+            return
+        self._here = torch.from_numpy(order)
+        self._there = self._here.to(model.device)
+        _set_rate(state, recipe, self._total)
+        self._captured = captured(
+            model, examples, state, recipe, self._whole, steps=steps - state.step
+        )
+
+    def step(self, first: int) -> Tensor:
+        """The step on the batch that begins at `first`; returns its loss, on the device."""
+        batch = slice(first, first + self._recipe.batch_size)
+        index = self._there[batch]
+        _set_rate(self._state, self._recipe, self._total)
+        if self._captured is not None and len(index) == self._captured.batch:
+            return self._captured(index)
+        return self._eager(index, self._here[batch])
+
+    def _eager(self, index: Tensor, host: Tensor | None, whole: bool = False) -> Tensor:
+        assert isinstance(self._examples, Examples)
+        generator = _generator(self._model, self._state, self._recipe)
+        with autocast(self._model, self._recipe.precision):
+            loss = self._examples.loss(self._model, index, generator, host=host, whole=whole)
+        _descend(loss, self._state, self._recipe)
+        return loss.detach()
+
+    def _whole(self, index: Tensor) -> Tensor:
+        return self._eager(index, None, whole=True)
 
 
 def _close_epoch(
@@ -399,7 +500,7 @@ def _close_epoch(
 
 
 def _check_weights(model: BaseModel, state: RunState) -> None:
-    if not all(bool(torch.isfinite(p).all()) for p in model.parameters()):
+    if not bool(torch.isfinite(state.parameters.flat).all()):
         raise DivergenceError(
             f"a weight is not finite in epoch {state.epoch + 1}, step {state.step}; the "
             "last good checkpoint is kept: lower the learning rate, or clip gradients (clip_norm)"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat.answers.blend import Blend
@@ -14,13 +15,20 @@ from offbeat.errors import InputError
 from offbeat.models.base import BaseModel
 
 
-def forecast(model: BaseModel | Blend, dataset: Dataset, horizons: ArrayLike) -> Dataset:
+def forecast(
+    model: BaseModel | Blend,
+    dataset: Dataset,
+    horizons: ArrayLike,
+    *,
+    device: str | torch.device | None = None,
+) -> Dataset:
     """Predicts each trajectory after its last row.
 
     Args:
         model: a trained model, or a blend, whose forecasts have intervals.
         dataset: the observed data.
         horizons: s after the last row: one number, or several that increase strictly, above 0.
+        device: that the model is computed on, as of `fit`, and moved back from; by default its own.
 
     Returns:
         One trajectory of predictions per trajectory, in original units, on the clock of the data;
@@ -33,7 +41,7 @@ def forecast(model: BaseModel | Blend, dataset: Dataset, horizons: ArrayLike) ->
     dataset = Dataset.of(dataset)
     after = checked_horizons(horizons)
     times = [t.times[-1] + after for t in dataset]
-    predicted = predict(model, dataset, times=times)
+    predicted = predict(model, dataset, times=times, device=device)
     unseen = np.zeros((len(after), model.channels), dtype=bool)
     return Dataset(
         tuple(replace(t, observed=unseen) for t in predicted),

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+import torch
 
 from offbeat.answers.answer import Answer
 from offbeat.answers.blend import Blend
@@ -18,6 +19,7 @@ from offbeat.answers.predict import (
 )
 from offbeat.data.rows import add_rows, times_at_rate
 from offbeat.data.trajectory import Dataset
+from offbeat.devices import placed
 from offbeat.errors import InputError, one_of
 from offbeat.models.base import BaseModel, of_channels
 
@@ -33,6 +35,7 @@ def impute(
     times: Times | None = None,
     rate_hz: float | None = None,
     seed: int = 0,
+    device: str | torch.device | None = None,
 ) -> Dataset:
     """Fills every value that is not observed: masked ones, and those that were never measured.
 
@@ -51,6 +54,7 @@ def impute(
         rate_hz: adds rows at this rate, from the first to the last row of each trajectory, where
             no row is within half a period.
         seed: of the generator of self-feeding.
+        device: that the model is computed on, as of `fit`, and moved back from; by default its own.
 
     Returns:
         The trajectories in original units, channels in the order of the model. No value is
@@ -79,9 +83,12 @@ def impute(
     dataset = of_channels(dataset, model.names, model.units)
     applied = transforms.apply(dataset)
     if mode == "causal":
-        answers = [t for t in predict(model, applied, seed=seed) if isinstance(t, Answer)]
+        found = predict(model, applied, seed=seed, device=device)
+        answers = [t for t in found if isinstance(t, Answer)]
     elif isinstance(model, Blend):
-        answers = [without_exogenous(a, model.predicted) for a in model.fill(applied, seed=seed)]
+        with placed(model, device, batch=len(applied)):
+            every = model.fill(applied, seed=seed)
+        answers = [without_exogenous(a, model.predicted) for a in every]
     else:
         raise InputError(
             "mode 'two_sided' needs a blend, got a single model; train one with offbeat train, or "

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat.answers.answer import Answer
@@ -14,6 +15,7 @@ from offbeat.answers.blend import Blend, model_rows
 from offbeat.config import check_seed
 from offbeat.data.rows import add_rows
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.devices import placed
 from offbeat.errors import InputError
 from offbeat.models.base import BaseModel, of_channels
 from offbeat.models.corrected import CorrectedModel
@@ -29,6 +31,7 @@ def predict(
     times: Times | None = None,
     seed: int = 0,
     size: int = 500,
+    device: str | torch.device | None = None,
 ) -> Dataset:
     """Predicts each trajectory at any times, from observations strictly before each time.
 
@@ -44,6 +47,7 @@ def predict(
             trajectory's own rows: one step ahead.
         seed: of the generator of self-feeding.
         size: trajectories per batch.
+        device: that the model is computed on, as of `fit`, and moved back from; by default its own.
 
     Returns:
         One trajectory of predictions per trajectory, in original units, at the requested times;
@@ -69,7 +73,8 @@ def predict(
         part = applied[first : first + size]
         asked_here = asked[first : first + size]
         merged = tuple(add_rows(t, at) for t, at in zip(part, asked_here, strict=True))
-        answers = _every_row(model, replace(part, trajectories=merged), seed)
+        with placed(model, device, batch=len(merged)):
+            answers = _every_row(model, replace(part, trajectories=merged), seed)
         for union, at, answer in zip(merged, asked_here, answers, strict=True):
             results.append(answer.rows_at(np.searchsorted(union.times, at)))
     return transforms.undo(Dataset(tuple(results), {"predicted_by": model.name}), dataset)

@@ -33,6 +33,7 @@ def evaluate_command(
     trajectory: int = 0,
     reader: dict[str, Any] | None = None,
     seed: int = 0,
+    device: str = "cpu",
     json: bool = False,
 ) -> None:
     """Score a trained model and simple baselines on the same values.
@@ -64,6 +65,8 @@ def evaluate_command(
         reader: how the log is read. What is not given is read as in training, unless a format is
             given.
         seed: of the mask, and of models with self-feeding.
+        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
+            from it.
         json: print the scores as JSON.
     """
     from offbeat.answers.blend import Blend
@@ -73,6 +76,7 @@ def evaluate_command(
     from offbeat.data.masking import mask_out
     from offbeat.data.redundant import leave_out_of
     from offbeat.data.splits import load_split
+    from offbeat.devices import moved
     from offbeat.evaluation import evaluate
     from offbeat.files import write_json
 
@@ -83,7 +87,7 @@ def evaluate_command(
     check_figure(figure)
     check_figure(calibration)
     after = None if horizons is None else checked_horizons(horizons).tolist()
-    loaded = load_run(model)
+    loaded = moved(load_run(model), device)
     forward = loaded.forward if isinstance(loaded, Blend) else loaded
     # As in training, where these channels were not masked.
     dataset = leave_out_of(read_log(data, reader, run=model), loaded.transforms)

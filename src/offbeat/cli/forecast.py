@@ -27,6 +27,7 @@ def forecast_command(
     channels: list[str] | None = None,
     trajectory: int = 0,
     reader: dict[str, Any] | None = None,
+    device: str = "cpu",
     json: bool = False,
 ) -> None:
     """Forecast what follows the last row of a log, in original units.
@@ -45,6 +46,8 @@ def forecast_command(
         trajectory: to plot, counted from 0.
         reader: how the log is read. What is not given is read as in training, unless a format is
             given.
+        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
+            from it.
         json: print what was written as JSON.
     """
     import numpy as np
@@ -53,6 +56,7 @@ def forecast_command(
     from offbeat.answers.saved import load_run
     from offbeat.cli.scored import forecast_figure
     from offbeat.data.writers.tables import write_table
+    from offbeat.devices import moved
 
     if horizons is None:
         raise InputError(
@@ -61,7 +65,7 @@ def forecast_command(
     check_out(out, data)
     check_figure(figure)
     after = checked_horizons(horizons)
-    loaded = load_run(model)
+    loaded = moved(load_run(model), device)
     dataset = read_log(data, reader, run=model)
     with busy("forecasting"):
         predicted = forecast(loaded, dataset, after)

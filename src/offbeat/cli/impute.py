@@ -31,6 +31,7 @@ def impute_command(
     trajectory: int = 0,
     reader: dict[str, Any] | None = None,
     seed: int = 0,
+    device: str = "cpu",
     json: bool = False,
 ) -> None:
     """Fill every value of a log that was not observed, in original units.
@@ -55,17 +56,20 @@ def impute_command(
         reader: how the log is read. What is not given is read as in training, unless a format is
             given.
         seed: of models with self-feeding.
+        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
+            from it.
         json: print what was written as JSON.
     """
     from offbeat.answers.impute import impute
     from offbeat.answers.saved import load_run
     from offbeat.cli.scored import fill_figure
+    from offbeat.devices import moved
     from offbeat.models.base import BaseModel
 
     check_answers(out, data, format)
     check_figure(figure)
     check_seed(seed)
-    loaded = load_run(model)
+    loaded = moved(load_run(model), device)
     if (model / "two_sided.json").is_file() and isinstance(loaded, BaseModel):
         print(
             f"offbeat: note: {model} is a two-sided run of an earlier version, whose rule is not "

@@ -22,6 +22,7 @@ def predict_command(
     time_unit: str | None = None,
     reader: dict[str, Any] | None = None,
     seed: int = 0,
+    device: str = "cpu",
     json: bool = False,
 ) -> None:
     """Predict one step ahead at the rows of a log, or at given times.
@@ -45,11 +46,14 @@ def predict_command(
         reader: how the log is read. What is not given is read as in training, unless a format is
             given.
         seed: of models with self-feeding.
+        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
+            from it.
         json: print what was written as JSON.
     """
     from offbeat.answers.predict import predict
     from offbeat.answers.saved import load_run
     from offbeat.data.writers.tables import write_table
+    from offbeat.devices import moved
 
     check_out(out, data)
     check_seed(seed)
@@ -59,7 +63,7 @@ def predict_command(
         reader = {**reader_options(reader, model), "time_unit": time_unit}
     if isinstance(times, float):
         times = [times]
-    loaded = load_run(model)
+    loaded = moved(load_run(model), device)
     dataset = read_log(data, reader, run=model)
     if times is not None:
         _check_since(dataset, times)

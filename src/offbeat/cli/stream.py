@@ -15,6 +15,7 @@ def stream_command(
     time_unit: str = "s",
     state: Path | None = None,
     seed: int = 0,
+    device: str = "cpu",
     stats: bool = False,
 ) -> None:
     """Run a model live: reads JSON lines from standard input, writes an answer for each.
@@ -34,6 +35,7 @@ def stream_command(
         state: JSON file with the state of a stream: restored if the file exists, written at the
             end.
         seed: of models with self-feeding.
+        device: that the model is computed on: cpu, cuda, cuda:1 or auto.
         stats: print latencies and counters as JSON on standard error at the end.
     """
     import json
@@ -64,7 +66,8 @@ def stream_command(
         from offbeat.stream.stream import Stream
 
         torch.set_num_threads(1)
-        stream = Stream(load_run(model), options, time_unit=time_unit, seed=seed)
+        loaded = load_run(model)
+        stream = Stream(loaded, options, time_unit=time_unit, seed=seed, device=device)
     if state is not None and state.exists():
         try:
             stream.restore(read_json(state))

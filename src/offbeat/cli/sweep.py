@@ -51,7 +51,7 @@ def sweep_command(
         engine: local (processes of this machine), ray or slurm.
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.
-        device: that models are trained on: cpu, cuda or cuda:1.
+        device: that models are trained on: cpu, cuda, cuda:1, or auto for a GPU where there is one.
         budget_minutes: stop after so long; the same command continues later.
         mixed: where out has runs of other code, of another processor, backend, torch or data,
             refuse to continue, accept them (the record marks them), or redo them.

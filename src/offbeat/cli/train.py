@@ -57,7 +57,8 @@ def train_command(
         reader: how the log is read; the run keeps these options for the other commands.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
-        device: that the model is trained on: cpu, cuda or cuda:1.
+        device: that the model is trained on: cpu, cuda, cuda:1, or auto for a GPU where there is a
+            gain.
         json: print the scores as JSON.
     """
     import torch

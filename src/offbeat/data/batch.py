@@ -112,10 +112,20 @@ class Batch:
             if field.name != "roles":
                 yield field.name, getattr(self, field.name)
 
-    def take(self, index: Tensor | slice) -> Batch:
-        """The trajectories at these positions, trimmed to the longest of them."""
-        valid = self.valid[index]
-        rows = int(valid.sum(dim=1).max())
+    @cached_property
+    def lengths(self) -> Tensor:
+        """(batch,) rows of each trajectory, on the CPU."""
+        return self.valid.sum(dim=1).cpu()
+
+    def take(self, index: Tensor | slice, *, host: Tensor | None = None) -> Batch:
+        """The trajectories at these positions, trimmed to the longest of them.
+
+        Args:
+            index: positions, on the CPU or on the device of the batch.
+            host: the same on the CPU, where `index` is not; then nothing waits for the device.
+        """
+        at = index if host is None else host
+        rows = int(self.lengths[at.cpu() if isinstance(at, Tensor) else at].max())
         cut: dict[str, Any] = {k: v[index][:, :rows] for k, v in self._tensors()}
         return replace(self, **cut)
 
@@ -147,9 +157,9 @@ class Batch:
             The batch with the values and masks of `action` channels moved by one row; `known` is
             unchanged.
         """
-        acts = torch.tensor([role == ACTION for role in self.roles], device=self.mask.device)
-        if not bool(acts.any()):
+        if ACTION not in self.roles:
             return self
+        acts = torch.tensor([role == ACTION for role in self.roles], device=self.mask.device)
         values = torch.cat([last[:, None].to(self.values), self.values[:, :-1]], dim=1)
         mask = torch.cat([seen[:, None], self.mask[:, :-1]], dim=1) & self.valid[..., None]
         return replace(

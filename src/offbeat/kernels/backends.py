@@ -38,6 +38,8 @@ class Backend:
         perceptron: (layers, x, activation, variant) to the outputs, or to None if the call
             cannot run; None for a backend without one.
         training: a context manager for training with this backend.
+        capturable: on a GPU, a whole training step with it can be recorded in a CUDA graph: nothing
+            in it waits for the GPU.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Backend:
     why_not: Callable[[], str] = str
     perceptron: Callable[[Layers, Tensor, str, str | None], Tensor | None] | None = None
     training: Callable[[], AbstractContextManager[None]] = nullcontext
+    capturable: bool = True
 
     def runnable(self) -> Sequence[str]:
         """The variants that run here, best first."""

@@ -46,7 +46,10 @@ def scan(
     gates = _gates(spec, parts, inputs)
     each_gate = [None] * inputs.rows if gates is None else gates.unbind(1)
     gaps, updates = inputs.gap[..., None].unbind(1), inputs.update[..., None].unbind(1)
-    shortest = inputs.rows if inputs.length is None else int(inputs.length.min())
+    known = inputs.known_steps
+    shortest = inputs.rows
+    if inputs.length is not None:
+        shortest = int(inputs.length.min()) if known is None else known.shortest
     steps = zip(gaps, updates, decays, each_gate, strict=True)
     for i, (gap, update, decay, gate) in enumerate(steps):
         old = state
@@ -364,8 +367,11 @@ class _Nodes:
             fresh = _given(inputs.updated)[..., None]
             each = zip(start.unbind(1), end.unbind(1), fresh.unbind(1), strict=True)
             decay = list(each)
-        whole, read = [0] * inputs.rows, [True] * inputs.rows
-        if spec.max_step is not None and not spec.loops:
+        whole: Sequence[int] = [0] * inputs.rows
+        read: Sequence[bool] = [True] * inputs.rows
+        if inputs.known_steps is not None and spec.max_step is not None:
+            whole, read = inputs.known_steps.whole, inputs.known_steps.read
+        elif spec.max_step is not None and not spec.loops:
             whole = [int(n) for n in (last - first).amax(dim=(0, 2)).tolist()]
             needed = inputs.gap > 0
             if spec.decay:  # after an update, the whole exponent is still to be applied

@@ -213,6 +213,23 @@ QUANTITIES = (
 """Names of the step inputs, in the order of the compiled code."""
 
 
+@dataclass(frozen=True)
+class KnownSteps:
+    """What a loop over the rows must know of a batch, so that it asks no other device for it.
+
+    Bounds do, too: a loop that takes more steps than needed gives the same states.
+
+    Attributes:
+        shortest: rows of the shortest trajectory, or fewer.
+        whole: per row, the largest number of steps from node to node, or more.
+        read: per row, False where no trajectory needs a step from the last node to the row.
+    """
+
+    shortest: int
+    whole: tuple[int, ...]
+    read: tuple[bool, ...]
+
+
 @dataclass(frozen=True, eq=False)
 class StepInputs:
     """The inputs of each step, which do not depend on trained parameters.
@@ -247,6 +264,7 @@ class StepInputs:
             the state. None: all rows count.
         fed: one bool per row, True where the decoded state replaces the observed values; with
             self-feeding only.
+        known_steps: what a loop over the rows must know; None: it is read from the tensors.
     """
 
     gap: Tensor
@@ -269,6 +287,7 @@ class StepInputs:
     mean: Tensor | None = None
     length: Tensor | None = None
     fed: tuple[bool, ...] = ()
+    known_steps: KnownSteps | None = None
 
     def __len__(self) -> int:
         return self.gap.shape[0]
@@ -287,6 +306,26 @@ class StepInputs:
         for name in QUANTITIES:
             if (tensor := getattr(self, name)) is not None:
                 yield tensor
+
+
+def _host(rows: StepInputs) -> tuple[Tensor, Tensor, Tensor]:
+    """`StepTable.host` of step inputs."""
+    count, longest = rows.gap.shape
+    lengths = torch.full((count,), longest) if rows.length is None else rows.length.cpu()
+    whole = torch.zeros((count, longest), dtype=torch.int64)
+    read = torch.ones((count, longest), dtype=torch.bool)
+    if rows.node is not None and rows.first_node is not None:
+        whole = (rows.node - rows.first_node).long().cpu()
+        needed = rows.gap > 0
+        if rows.updated is not None:  # after an update, the whole exponent is still to be applied
+            needed = needed | ((rows.node == 0) & (rows.updated > 0))
+        read = needed.cpu()
+    return lengths, whole, read
+
+
+def _steps(lengths: Tensor, whole: Tensor, read: Tensor, rows: int) -> KnownSteps:
+    most, needed = whole[:, :rows].amax(dim=0), read[:, :rows].any(dim=0)
+    return KnownSteps(int(lengths.min()), tuple(most.tolist()), tuple(needed.tolist()))
 
 
 def nodes_before(time: Tensor) -> tuple[Tensor, Tensor]:
@@ -316,6 +355,9 @@ class StepTable:
         high: as `StepInputs.high`.
         mean: as `StepInputs.mean`.
         length: as `StepInputs.length`.
+        host: where the table is on another device, what the CPU knows of it: (trajectories,)
+            lengths, (trajectories, rows) steps from node to node, and whether a row is read from
+            its node by a further step.
     """
 
     table: Tensor
@@ -324,6 +366,7 @@ class StepTable:
     high: Tensor | None
     mean: Tensor | None
     length: Tensor | None
+    host: tuple[Tensor, Tensor, Tensor] | None = None
 
     @classmethod
     def of(cls, rows: StepInputs) -> StepTable:
@@ -344,7 +387,8 @@ class StepTable:
                 width += column.shape[2]
             places.append((name, known[id(value)], value.ndim == 3))
         fixed = (rows.low, rows.high, rows.mean, rows.length)
-        return cls(torch.cat(columns, dim=2), tuple(places), *fixed)
+        host = None if rows.gap.device.type == "cpu" else _host(rows)
+        return cls(torch.cat(columns, dim=2), tuple(places), *fixed, host)
 
     def __len__(self) -> int:
         return len(self.table)
@@ -355,16 +399,37 @@ class StepTable:
         where = {name: (at.start, at.stop - at.start) for name, at, _ in self.places}
         return tuple(where.get(name, (0, 0)) for name in QUANTITIES)
 
-    def take(self, index: Tensor) -> TableSteps:
+    def take(self, index: Tensor, *, host: Tensor | None = None) -> TableSteps:
         """Some trajectories, trimmed to the longest of them.
 
         Args:
             index: (batch,) positions, int64, on any device.
+            host: the same on the CPU, where `index` is not; then nothing waits for the device.
         """
+        if host is None and index.device.type == "cpu":
+            host = index
         index = index.to(self.table.device)
         length = None if self.length is None else self.length.index_select(0, index)
-        rows = self.table.shape[1] if length is None else int(length.max())
-        return TableSteps(self, index, rows, length)
+        if self.host is None or host is None:
+            rows = self.table.shape[1] if length is None else int(length.max())
+            return TableSteps(self, index, rows, length)
+        lengths, whole, read = (each.index_select(0, host) for each in self.host)
+        rows = int(lengths.max())
+        return TableSteps(self, index, rows, length, known_steps=_steps(lengths, whole, read, rows))
+
+    def take_whole(self, index: Tensor) -> TableSteps:
+        """Some trajectories, not trimmed, with the steps of the whole table: of a fixed shape.
+
+        Args:
+            index: (batch,) positions, int64, on the device of the table.
+        """
+        length = None if self.length is None else self.length.index_select(0, index)
+        return TableSteps(self, index, self.table.shape[1], length, known_steps=self._steps_of_all)
+
+    @cached_property
+    def _steps_of_all(self) -> KnownSteps:
+        host = self.host or _host(self.take(torch.arange(len(self))).gathered())
+        return _steps(*host, self.table.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,6 +442,7 @@ class TableSteps:
         rows: of the longest of them.
         length: (batch,) as `StepInputs.length`.
         fed: as `StepInputs.fed`.
+        known_steps: as `StepInputs.known_steps`.
     """
 
     table: StepTable
@@ -384,6 +450,7 @@ class TableSteps:
     rows: int
     length: Tensor | None
     fed: tuple[bool, ...] = ()
+    known_steps: KnownSteps | None = None
 
     def __len__(self) -> int:
         return len(self.index)
@@ -397,7 +464,8 @@ class TableSteps:
         }
         whole = self.table
         given |= {"low": whole.low, "high": whole.high, "mean": whole.mean}
-        return StepInputs(**given, length=self.length, fed=self.fed)
+        given |= {"length": self.length, "fed": self.fed, "known_steps": self.known_steps}
+        return StepInputs(**given)
 
     def known(self) -> Iterator[Tensor]:
         """All tensors of numbers that are present."""

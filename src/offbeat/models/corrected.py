@@ -60,13 +60,14 @@ class CorrectedInputs:
     def __len__(self) -> int:
         return len(self.base)
 
-    def take(self, index: Tensor) -> CorrectedInputs:
+    def take(self, index: Tensor, *, host: Tensor | None = None) -> CorrectedInputs:
         """Some trajectories, trimmed to the longest of them.
 
         Args:
             index: (batch,) positions, int64.
+            host: as of `StepTable.take`.
         """
-        inner, index = self.inner.take(index), index.to(self.base.device)
+        inner, index = self.inner.take(index, host=host), index.to(self.base.device)
         base, at = (of[:, : inner.rows].index_select(0, index) for of in (self.base, self.at))
         return CorrectedInputs(inner, base, at)
 

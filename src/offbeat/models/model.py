@@ -74,6 +74,7 @@ class Model(BaseModel):
         InputError: a field of the config is None, or parts are incompatible.
     """
 
+    is_action: Tensor
     low: Tensor
     high: Tensor
 
@@ -124,6 +125,8 @@ class Model(BaseModel):
         )
         self.head = HEADS[config.head or "point"](shape)
         low, high = self._range()
+        acts = torch.tensor([role == ACTION for role in self.roles])
+        self.register_buffer("is_action", acts, persistent=False)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
         self._initialise(seed)
@@ -226,9 +229,15 @@ class Model(BaseModel):
             generator = torch.Generator().manual_seed(0)
         empty = RecurrentState.empty(self.first_state(batch), self.mean, generator=generator)
         if self.trend is not None:
-            prior = self.filters.prior().to(self.mean.device)
+            prior = self._filters_here().prior()
             empty = replace(empty, covariance=prior.expand(batch, -1, -1))
         return empty
+
+    def _filters_here(self) -> Filters:
+        """The filters on the device of the model."""
+        if self.filters.table.device != self.device:
+            self.filters = self.filters.to(self.device)
+        return self.filters
 
     def backend(self) -> tuple[str, str]:
         """The variant of the scan's backend that runs this model, and the reason."""
@@ -314,7 +323,7 @@ class Model(BaseModel):
                 assert commit is not None
                 now = torch.where(commit[..., None] > 0, after, before)
             then = self.head.decode(now)
-            acts = torch.tensor([role == ACTION for role in self.roles], device=after.device)
+            acts = self.is_action
             scale = found.scale
             if scale is not None and then.scale is not None:
                 scale = torch.where(acts, then.scale, scale)
@@ -400,7 +409,7 @@ class Model(BaseModel):
             rows = replace(rows, gap=gap, first_node=first, node=node, commit=commit)
         if spec.trend:
             assert past.covariance is not None
-            level, slope, covariance = self.filters.to(mask.device).gains(
+            level, slope, covariance = self._filters_here().gains(
                 at_rows.delta,
                 mask,
                 past.channel_at > -torch.inf,
@@ -458,7 +467,7 @@ class Model(BaseModel):
         if last is None:
             last = torch.full_like(batch.values[:, 0], torch.nan)
         at = (batch.valid.sum(dim=1) - 1)[:, None, None].expand(-1, 1, batch.channels)
-        acts = torch.tensor([role == ACTION for role in self.roles], device=batch.mask.device)
+        acts = self.is_action
         ended = torch.where(batch.mask & acts, batch.values, torch.nan).gather(1, at)[:, 0]
         seen = ~last.isnan()
         return batch.inputs(torch.where(seen, last, 0.0), seen), ended

@@ -75,7 +75,7 @@ class Cell(nn.Module):
             state: (batch, hidden + memory) h, and the memory of a cell that has one.
             update: (batch, 1) 1.0 where the cell acts, 0.0 where the state does not change.
         """
-        return torch.lerp(state, self.new(gates, state), update)
+        return torch.lerp(state, self.new(gates, state).to(state.dtype), update)
 
     def new(self, gates: Tensor, state: Tensor) -> Tensor:
         """The state after an observation, where the cell acts; for cells that keep `step`."""
@@ -148,7 +148,7 @@ class GRU(Cell):
             candidate = torch.tanh(gates[:, 2 * n :] + r * product)
         else:
             candidate = torch.tanh(torch.addmm(gates[:, 2 * n :], r * h, recurrent[2 * n :].t()))
-        return torch.lerp(h, candidate, z * update)
+        return torch.lerp(h, candidate.to(h.dtype), z * update)  # products may be in bfloat16
 
 
 CELLS: Registry[type[Cell]] = Registry("cell", group="offbeat.cells")

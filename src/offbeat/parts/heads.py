@@ -65,6 +65,7 @@ class Head(nn.Module):
 
     mean: Tensor
     std: Tensor
+    _acts: Tensor
 
     def __init__(self, shape: HeadShape) -> None:
         super().__init__()
@@ -75,6 +76,9 @@ class Head(nn.Module):
         # An observation sets its channels of x, and only h is updated with weights: actions
         # are decoded from x and h together.
         self.actions, self.policy = list(shape.actions), None
+        self.register_buffer(
+            "_acts", torch.tensor(self.actions, dtype=torch.int64), persistent=False
+        )
         if shape.anchored and shape.actions:
             width = shape.anchors + shape.hidden_size
             self.policy = Perceptron((width, *shape.units, len(shape.actions)), "tanh")
@@ -114,7 +118,7 @@ class Head(nn.Module):
         if self.policy is not None:
             driven = state[..., : self.anchors + self.hidden_size]
             chosen = perceptron(self.policy.layers, driven, "tanh")
-            x = x.index_copy(-1, torch.tensor(self.actions, device=x.device), chosen)
+            x = x.index_copy(-1, self._acts, chosen)
         return x * self.std + self.mean
 
 

@@ -39,7 +39,10 @@ class CpuEngine(Engine):
         further = {}
         if spec.trend:
             filters = model.filters
-            further = {"filters": filters.table.numpy(), "prior": filters.prior().numpy()}
+            further = {
+                "filters": filters.table.cpu().numpy(),
+                "prior": filters.prior().cpu().numpy(),
+            }
         with torch.no_grad():
             self._live = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")(
                 spec=cpu.compiled_spec(spec),

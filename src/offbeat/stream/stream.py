@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
+
 from offbeat.answers.blend import Blend
 from offbeat.config import check_seed
 from offbeat.data.scaler import Scaler
+from offbeat.devices import resolved
 from offbeat.models.base import BaseModel
 from offbeat.models.corrected import CorrectedModel
 from offbeat.models.model import Model
@@ -38,6 +41,8 @@ class Stream(LiveStream):
         options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns. Integers are exact.
         seed: of the generator of self-feeding.
+        device: that the model is moved to, as of `fit`; by default its own. A message is one
+            trajectory, which gains nothing from a GPU: `auto` takes the CPU for models of parts.
         **fields: fields of `StreamOptions` that replace those of `options`.
 
     Raises:
@@ -56,10 +61,13 @@ class Stream(LiveStream):
         *,
         time_unit: str = "s",
         seed: int = 0,
+        device: str | torch.device | None = None,
         **fields: Any,
     ) -> None:
         chosen, seed = with_options(options, fields), check_seed(seed)
         forward = model.forward if isinstance(model, Blend) else model
+        if device is not None and forward is not None:
+            forward.to(resolved(device, forward, batch=1))
         engine: Engine | None = None
         if forward is not None:
             window = chosen.window_rows or forward.statistics.rows or 1

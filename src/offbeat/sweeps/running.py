@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset
+from offbeat.devices import resolved
 from offbeat.errors import InputError, one_of
 from offbeat.files import clean, writable, write_json
 from offbeat.sweeps.engines import engine_named
@@ -105,7 +106,8 @@ def run_plan(
         marked as they are, or `redo` them.
         processes: runs at a time; by default as many as there is room for.
         threads: of each run.
-        device: that models are trained on: `cpu`, `cuda` or `cuda:1`.
+        device: that models are trained on: `cpu`, `cuda` or `cuda:1`; `auto`, of the local engine,
+            takes a GPU where there is one.
         budget_minutes: stop after this time, in the middle of runs; the next call resumes them.
         engine_options: of Ray or Slurm.
         progress: show how far it is on standard error.
@@ -120,6 +122,13 @@ def run_plan(
     one_of("value of mixed", mixed, MIXED)
     if budget_minutes is not None and not budget_minutes >= 0:
         raise InputError(f"budget_minutes must be at least 0, got {budget_minutes}")
+    if engine == "local":  # other machines have other devices
+        device = device if device == "cpu" else str(resolved(device))
+    elif device == "auto":
+        raise InputError(
+            f"device 'auto' is that of this machine, and the engine {engine!r} runs on others; "
+            "give cpu or cuda"
+        )
     out = writable(out, folder=True)
     asked = plan.runs() if asked is None else tuple(asked)
     out.mkdir(parents=True, exist_ok=True)

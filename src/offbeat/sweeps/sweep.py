@@ -169,11 +169,13 @@ def sweep(
             see `out` under the same path.
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.
-        device: that models are trained on: `cpu`, `cuda` or `cuda:1`.
+        device: that models are trained on: `cpu`, `cuda` or `cuda:1`; `auto`, of the local engine,
+            takes a GPU where there is one.
         budget_minutes: stop after this time, in the middle of runs; the next call resumes them.
         mixed: what to do with runs in `out` that were made by other code, on another processor,
             with another backend, torch or data: `refuse` to continue, `accept` or `redo` them.
-        engine_options: arguments of `ray.init`, or of submitit's `update_parameters`.
+        engine_options: arguments of `ray.init` and `gpus_per_run`, which may be a fraction; or of
+            submitit's `update_parameters`.
         progress: show how far it is on standard error.
 
     Returns:

@@ -19,11 +19,20 @@ class RayEngine(Engine):
     Args:
         processes: runs at a time; by default as many as the cluster's cores allow.
         threads: of each run.
-        options: arguments of `ray.init`, `address` above all.
+        options: arguments of `ray.init`, `address` above all; and `gpus_per_run`, such as 0.25 for
+            four runs on each GPU, of which a run sees its own alone. By default none is reserved.
+
+    Raises:
+        InputError: no cluster answers, or there are too few GPUs for one run.
     """
 
     def __init__(self, processes: int | None, threads: int, options: Mapping[str, Any]) -> None:
         self._ray: Any = require("ray", "cluster")
+        options = dict(options)
+        gpus = options.pop("gpus_per_run", 0)
+        if isinstance(gpus, bool) or not isinstance(gpus, int | float) or not gpus >= 0:
+            raise InputError(f"gpus_per_run must be a number of at least 0, got {gpus!r}")
+        self._jobs: dict[Any, Job] = {}
         self._started = not self._ray.is_initialized()
         where = "the running cluster"
         if self._started:
@@ -40,11 +49,21 @@ class RayEngine(Engine):
                 self._ray.init(**{"num_cpus": cores, "include_dashboard": False, **quiet})
                 where = "a cluster of this machine"
         cores = int(self._ray.cluster_resources().get("CPU", 1))
-        self.capacity = processes or max(1, cores // threads)
-        self.description = f"Ray on {where}, {self.capacity} at a time, {cores} cores"
+        room, has = max(1, cores // threads), f"{cores} cores"
+        if gpus:
+            there = float(self._ray.cluster_resources().get("GPU", 0))
+            if there < gpus:
+                self.stop()
+                raise InputError(
+                    f"gpus_per_run is {gpus:g}, the cluster has {there:g} GPUs; give less, or "
+                    "leave it out"
+                )
+            room, has = min(room, int(there / gpus)), f"{has}, {there:g} GPUs"
+        self.capacity = processes or room
+        self.description = f"Ray on {where}, {self.capacity} at a time, {has}"
         # The session submits the run of a lost worker again, and counts how often.
-        self._attempt = self._ray.remote(num_cpus=threads, max_retries=0)(attempt)
-        self._jobs: dict[Any, Job] = {}
+        reserved = {"num_cpus": threads, "num_gpus": gpus, "max_retries": 0}
+        self._attempt = self._ray.remote(**reserved)(attempt)
 
     def submit(self, job: Job) -> None:
         """Submits the job to the cluster."""
