@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import torch
 from common import machine, synthetic, write
-from peers import JaxStep, TorchStep, inputs_of
+from other_libraries import JaxStep, TorchStep, inputs_of
 
 import offbeat as ob
 from offbeat import kernels

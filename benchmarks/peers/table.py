@@ -1,0 +1,129 @@
+"""Writes results into the document: a table per log, and how each peer was run."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from .registry import PEERS
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "benchmarks_peers.md"
+
+
+def fill_in(text: str, out: Path) -> str:
+    """The document with its tables replaced.
+
+    Args:
+        text: of the document; a table is between `<!-- NAME -->` and `<!-- end of NAME -->`.
+        out: folder of the results.
+    """
+
+    def found(match: re.Match[str]) -> str:
+        name = match.group(1)
+        body = settings(out) if name == "settings" else rows(name, out)
+        return f"<!-- {name} -->\n\n{body}\n\n<!-- end of {name} -->"
+
+    return re.sub(r"<!-- (\w+) -->.*?<!-- end of \1 -->", found, text, flags=re.DOTALL)
+
+
+def rows(log: str, out: Path) -> str:
+    """The table of a log.
+
+    Args:
+        log: name.
+        out: folder of the results.
+    """
+    found = results_of(log, out)
+    tasks: list[str] = []
+    for result in found.values():
+        tasks += [task for task in result.get("scores", {}) if task not in tasks]
+    best = {
+        task: min(r["scores"][task]["rmse_scaled"] for r in found.values() if _has(r, task))
+        for task in tasks
+    }
+    head = ["", *tasks, "within 90 %: fill; forecasts", "fit, s", "answer, s", "MB", "lines"]
+    lines = [_line(head), _line(["---"] * len(head))]
+    for result in found.values():
+        if "error" in result:
+            said = result["error"][:80]
+            lines.append(_line([result["title"], f"failed: {said}", *[""] * (len(head) - 2)]))
+            continue
+        cells = [result["title"]]
+        for task in tasks:
+            value = result["scores"][task]["rmse_scaled"] if _has(result, task) else None
+            shown = "" if value is None else f"{value:.3g}"
+            cells.append(f"**{shown}**" if value == best[task] else shown)
+        cells += [_coverage(result), f"{result['fit_cpu_s']:.3g}", f"{result['answer_cpu_s']:.3g}"]
+        cells += [str(result["peak_mb"]), str(result["lines"])]
+        lines.append(_line(cells))
+    return "\n".join(lines)
+
+
+def settings(out: Path) -> str:
+    """The table of versions, settings and commands.
+
+    Args:
+        out: folder of the results.
+    """
+    lines = [_line(["", "versions", "what was chosen", "command"]), _line(["---"] * 4)]
+    for name, peer in PEERS.items():
+        logs = {log: results_of(log, out).get(name) for log in sorted(_logs(out))}
+        ran = [result for result in logs.values() if result and "versions" in result]
+        if not ran:
+            continue
+        versions = {
+            f"{package} {version}"
+            for result in ran
+            for package, version in result["versions"].items()
+            if package != "python"
+        }
+        command = re.sub(r"--log \w+", "--log LOG", ran[0]["command"])
+        said = [peer.title, ", ".join(sorted(versions)), ran[0]["settings"], f"`{command}`"]
+        lines.append(_line(said))
+    return "\n".join(lines)
+
+
+def results_of(log: str, out: Path) -> Mapping[str, dict[str, Any]]:
+    """Results of seed 0 by peer, in the order of the registry.
+
+    Args:
+        log: name.
+        out: folder of the results.
+    """
+    files = {name: out / log / f"{name}.json" for name in PEERS}
+    return {
+        name: json.loads(path.read_text(encoding="utf-8"))
+        for name, path in files.items()
+        if path.exists()
+    }
+
+
+def _logs(out: Path) -> list[str]:
+    return [path.name for path in out.iterdir() if path.is_dir()] if out.exists() else []
+
+
+def _has(result: Mapping[str, Any], task: str) -> bool:
+    return task in result.get("scores", {})
+
+
+def _coverage(result: Mapping[str, Any]) -> str:
+    """Coverage of the fill, then the mean over forecasts, in percent."""
+    each = [
+        (task, scores["coverage_90"])
+        for task, scores in result["scores"].items()
+        if "coverage_90" in scores
+    ]
+    if not each:
+        return ""
+    fills = [f"{100 * value:.0f}" for task, value in each if task.startswith("fill")]
+    ahead = [value for task, value in each if task.startswith("forecast")]
+    return (
+        f"{fills[0] if fills else '–'}; {100 * sum(ahead) / len(ahead):.0f}" if ahead else fills[0]
+    )
+
+
+def _line(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
