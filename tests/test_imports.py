@@ -28,6 +28,7 @@ STAGES = (
     "parts",
     "models",
     "devices",
+    "distributed",
     "calibration",
     "metrics",
     "examples",

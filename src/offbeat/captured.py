@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from offbeat.config import Recipe
+from offbeat.distributed import current
 from offbeat.errors import InputError
 from offbeat.examples import Examples
 from offbeat.kernels import StepTable, choose
@@ -65,6 +66,8 @@ def unsupported(model: BaseModel, examples: object, recipe: Recipe, steps: int) 
     """
     if os.environ.get(VARIABLE) == "0":
         return f"{VARIABLE}=0"
+    if current() is not None:
+        return "several ranks exchange their gradients within a step"
     if model.device.type != "cuda":
         return f"the model is on {model.device}, not on a CUDA device"
     if not isinstance(model, Model) or not isinstance(examples, Examples):

@@ -269,6 +269,27 @@ class Examples:
         typical = self.typical.index_select(0, index)[:, :rows]
         return relative_loss(prediction.mean, targets, typical, mask)
 
+    def weighed(
+        self,
+        model: BaseModel,
+        index: Tensor,
+        generator: torch.Generator | None,
+        *,
+        host: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The loss, and how many values it is the mean of, or the sum of their weights.
+
+        Args:
+            model: in its current state.
+            index: (batch,) positions of the trajectories.
+            generator: of self-feeding.
+            host: as of `loss`.
+        """
+        loss = self.loss(model, index, generator, host=host)
+        if self.counted is None:
+            return loss, loss.new_tensor(len(index) * self.targets[0].numel())
+        return loss, self.counted.index_select(0, index.to(self.counted.device)).sum()
+
 
 class RedrawnExamples:
     """The windows and masks of an epoch; their inputs are computed for `AHEAD` batches at a time.
@@ -293,14 +314,26 @@ class RedrawnExamples:
 
     def loss(self, model: BaseModel, index: Tensor, generator: torch.Generator | None) -> Tensor:
         """As that of `Examples`."""
+        some, at = self._with_inputs(model, index)
+        return some.loss(model, at, generator)
+
+    def weighed(
+        self, model: BaseModel, index: Tensor, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """As that of `Examples`."""
+        some, at = self._with_inputs(model, index)
+        return some.weighed(model, at, generator)
+
+    def _with_inputs(self, model: BaseModel, index: Tensor) -> tuple[Examples, Tensor]:
+        """Examples with these trajectories, and their positions there."""
         turn = self._turn[index.cpu()]
         first, last = int(turn.min()), int(turn.max())
         if last - first >= len(index):  # not in the order of the epoch
-            return self._examples(model, index).loss(model, torch.arange(len(index)), generator)
+            return self._examples(model, index), torch.arange(len(index))
         if self._some is None or first not in self._turns or last not in self._turns:
             self._turns = range(first, min(first + AHEAD * len(index), len(self)))
             self._some = self._examples(model, self._order[first : self._turns.stop])
-        return self._some.loss(model, turn - self._turns.start, generator)
+        return self._some, turn - self._turns.start
 
     def _examples(self, model: BaseModel, index: Tensor) -> Examples:
         batch = self._drawn.take(index)

@@ -13,6 +13,7 @@ from offbeat.baselines import BASELINES, Baseline, CausalBaseline
 from offbeat.config import ModelConfig, TrainConfig, check_seed, from_mapping
 from offbeat.data.scaler import Scaler, ScalerKind
 from offbeat.data.trajectory import Dataset
+from offbeat.distributed import current
 from offbeat.errors import DivergenceError, FileFormatError, InputError
 from offbeat.examples import fitted_baselines, number_of_tasks, ordered, reference_tasks
 from offbeat.files import writable, write_json
@@ -165,6 +166,11 @@ def fit_ladder(
     if budget_s is not None and not 0 < budget_s < math.inf:
         raise InputError(f"budget_s must be a positive number of seconds, got {budget_s!r}")
     folder = writable(out, folder=True) if out is not None else None
+    if current() is not None:
+        raise InputError(
+            "several ranks train one model, and the choice among models goes by their time; give "
+            "the model, such as --model.name anchored_trend"
+        )
     ladder = _Ladder(train, validation, config, scaler, baselines, seed, device, progress)
     trials, trial_epochs = ladder.plan(candidates, budget_s, folder)
     trained: list[BaseModel] = []

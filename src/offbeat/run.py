@@ -165,6 +165,48 @@ def _optimizer(flat: torch.nn.Parameter, recipe: Recipe) -> torch.optim.Optimize
     return optimizer
 
 
+def packed(model: BaseModel, state: RunState) -> dict[str, Any]:
+    """Weights and state of a training, to be sent to other ranks.
+
+    Args:
+        model: in its current state.
+        state: of its training.
+    """
+    moments = state.optimizer.state.get(state.parameters.flat, {})
+    return {
+        "weights": {k: v.detach().cpu() for k, v in model.state_dict().items()},
+        "moments": {k: torch.as_tensor(v).cpu() for k, v in moments.items()},
+        "best": {k: v.cpu() for k, v in state.best.items()},
+        "fields": {name: getattr(state, name) for name in _FIELDS},
+    }
+
+
+def unpack(model: BaseModel, state: RunState, given: dict[str, Any]) -> None:
+    """Takes what `packed` gave on another rank.
+
+    Args:
+        model: gets the weights.
+        state: gets the rest.
+        given: of the first rank.
+    """
+    model.load_state_dict(given["weights"])
+    device = state.parameters.flat.device
+    if given["moments"]:
+        state.optimizer.state[state.parameters.flat] = {
+            k: v.to(device) if v.ndim or device.type == "cuda" else v
+            for k, v in given["moments"].items()
+        }
+    state.best = given["best"]
+    for name, value in given["fields"].items():
+        setattr(state, name, value)
+
+
+_FIELDS = (
+    "epoch", "step", "total_steps", "loss_sum", "seconds", "history", "best_mse", "best_epoch",
+    "rate_factor", "diverged",
+)  # fmt: skip
+"""What a state holds besides tensors."""
+
 LOCK = ".lock"
 """File in a run's folder with the id of the process that trains there."""
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from offbeat.captured import CapturedStep, autocast, captured, check_precision, 
 from offbeat.config import Recipe, TrainConfig
 from offbeat.data.trajectory import Dataset
 from offbeat.devices import resolved
+from offbeat.distributed import Ranks, current, device_here, is_first, on_first
 from offbeat.errors import DivergenceError, InputError
 from offbeat.examples import (
     Examples,
@@ -45,8 +47,10 @@ from offbeat.run import (
     flat_parameters,
     identity_of,
     locked,
+    packed,
     resume_run,
     save_run,
+    unpack,
     write_log,
 )
 
@@ -113,6 +117,9 @@ def fit(
     each trajectory and masks its values anew (see `redraw`); all else is as without. Batches, their
     order and all random numbers depend only on `config.seed`.
 
+    Within `offbeat.distributed.group`, it is one training by all ranks: each takes its part of
+    every batch, and the first one writes `out`.
+
     Where the loss or a weight turns infinite or NaN and the best weights are kept, the training
     resumes from these, once, at half the learning rate, and ends with them if it diverges again.
 
@@ -147,10 +154,12 @@ def fit(
     asked = config or TrainConfig()
     if validation is None and (asked.patience is not None or asked.keep == "best"):
         raise InputError("patience and keep='best' need a validation set; got none")
-    folder = writable(out, folder=True) if out is not None else None
+    folder = writable(out, folder=True) if out is not None and is_first() else None
+    progress = progress and is_first()
     if device is not None:
         size = recipe_of(model.name, asked, validated=validation is not None).batch_size
-        model.to(resolved(device, model, batch=size))
+        there = device_here(device) if isinstance(device, str) else device
+        model.to(resolved(there, model, batch=size))
     if asked.tasks is not None:
         model.expect_silences(asked.tasks.horizon_s)
     trained_on = ordered(model, train)
@@ -177,8 +186,8 @@ def fit(
             "observation; give a longer validation set, or keep='last' and no patience"
         )
     with ExitStack() as stack:
-        if folder is not None:
-            stack.enter_context(locked(folder))
+        if folder is not None or current() is not None:
+            on_first(lambda: _lock(stack, folder))
         examples = stack.enter_context(
             closing(
                 TrainingSet(
@@ -193,16 +202,28 @@ def fit(
         stack.enter_context(model.threads())
         state = RunState(parameters, recipe)
         identity: dict[str, Any] = {}
-        if folder is not None:
-            identity = identity_of(model, recipe, train, validation, baselines)
-            resume_run(folder, model, state, identity)
-            if state.epoch > recipe.epochs:
-                raise InputError(
-                    f"{folder} holds a run of {state.epoch} epochs already, {recipe.epochs} were "
-                    "requested; give another folder"
-                )
+
+        def resume() -> Any:
+            if folder is not None:
+                identity.update(identity_of(model, recipe, train, validation, baselines))
+                resume_run(folder, model, state, identity)
+                if state.epoch > recipe.epochs:
+                    raise InputError(
+                        f"{folder} holds a run of {state.epoch} epochs already, {recipe.epochs} "
+                        "were requested; give another folder"
+                    )
+            return packed(model, state) if current() is not None else None
+
+        given = on_first(resume)
+        if not is_first():
+            unpack(model, state, given)
         run = (recipe, state, folder, identity, callbacks, progress)
         return _fit(model, examples, validated, *run)
+
+
+def _lock(stack: ExitStack, folder: Path | None) -> None:
+    if folder is not None:
+        stack.enter_context(locked(folder))
 
 
 def _fit(
@@ -238,8 +259,8 @@ def _fit(
             if folder is not None:
                 save_run(folder, model, state, identity)
                 write_log(folder, state.history)
-            for callback in callbacks:
-                stopped = bool(callback(record, model)) or stopped
+            if callbacks:
+                stopped = on_first(partial(_told, callbacks, record, model)) or stopped
     if writer:
         writer.close()
     if recipe.keep == "best" and state.best:
@@ -250,6 +271,12 @@ def _fit(
     return FitResult(
         tuple(state.history), early, folder, recipe, state.best_epoch, diverged=state.diverged
     )
+
+
+def _told(callbacks: Sequence[Callback], record: EpochRecord, model: BaseModel) -> bool:
+    """Calls all callbacks; True if one of them stops the training."""
+    told = [bool(callback(record, model)) for callback in callbacks]
+    return any(told)
 
 
 def _recover(model: BaseModel, state: RunState, recipe: Recipe, error: DivergenceError) -> bool:
@@ -338,6 +365,13 @@ def train_step(
     Raises:
         DivergenceError: the loss is not finite.
     """
+    ranks = current()
+    if ranks is not None:
+        _set_rate(state, recipe, total)
+        value = float(_descend_together(ranks, model, examples, index, state, recipe))
+        _check_loss(value, state.epoch, state.step)
+        state.optimizer.step()
+        return value
     with autocast(model, recipe.precision):
         loss = examples.loss(model, index, _generator(model, state, recipe))
     value = float(loss.detach())
@@ -376,9 +410,44 @@ def _descend(loss: Tensor, state: RunState, recipe: Recipe) -> None:
     """Backward pass, clipping and the step of the optimizer."""
     state.parameters.zero_gradient()
     (loss * recipe.loss_scale).backward()  # type: ignore[no-untyped-call]
+    _clip(state, recipe)
+    state.optimizer.step()
+
+
+def _clip(state: RunState, recipe: Recipe) -> None:
     if recipe.clip_norm is not None:
         torch.nn.utils.clip_grad_norm_([state.parameters.flat], recipe.clip_norm)
-    state.optimizer.step()
+
+
+def _descend_together(
+    ranks: Ranks,
+    model: BaseModel,
+    examples: Examples | RedrawnExamples,
+    index: Tensor,
+    state: RunState,
+    recipe: Recipe,
+    *,
+    host: Tensor | None = None,
+) -> Tensor:
+    """The gradient of a batch, of which each rank takes its part; returns the loss of the batch.
+
+    The step of the optimizer is left to the caller.
+    """
+    state.parameters.zero_gradient()
+    own = ranks.share(index)
+    loss = count = state.parameters.flat.new_zeros(())
+    if len(own):
+        generator = _generator(model, state, recipe)
+        with autocast(model, recipe.precision):
+            if host is None:
+                loss, count = examples.weighed(model, own, generator)
+            else:
+                assert isinstance(examples, Examples)
+                loss, count = examples.weighed(model, own, generator, host=ranks.share(host))
+        (loss * recipe.loss_scale).backward()  # type: ignore[no-untyped-call]
+    whole = ranks.reduce(state.parameters.gradient, loss, count)
+    _clip(state, recipe)
+    return whole
 
 
 class _Losses:
@@ -448,6 +517,18 @@ class _Elsewhere:
 
     def _eager(self, index: Tensor, host: Tensor | None, whole: bool = False) -> Tensor:
         assert isinstance(self._examples, Examples)
+        if (ranks := current()) is not None:
+            loss = _descend_together(
+                ranks,
+                self._model,
+                self._examples,
+                index,
+                self._state,
+                self._recipe,
+                host=host,
+            )
+            self._state.optimizer.step()
+            return loss
         generator = _generator(self._model, self._state, self._recipe)
         with autocast(self._model, self._recipe.precision):
             loss = self._examples.loss(self._model, index, generator, host=host, whole=whole)
@@ -465,7 +546,10 @@ def _close_epoch(
     recipe: Recipe,
 ) -> None:
     _check_weights(model, state)
-    found = validated.judge(model, seed=recipe.seed) if validated is not None else None
+    # On the first rank alone, so that all ranks stop at the same epoch.
+    found = None
+    if validated is not None:
+        found = on_first(lambda: validated.judge(model, seed=recipe.seed))
     scores = found.scores if found is not None else None
     if (
         scores is not None

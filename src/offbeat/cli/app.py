@@ -159,9 +159,11 @@ def run_commands(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (OffbeatError, OSError) as error:
+        if os.environ.get("RANK", "0") != "0" and not isinstance(error, ConnectionError):
+            return 2  # the first of several ranks says it
         said = of_system(error) if isinstance(error, OSError) else str(error)
         said = parsers[command].spoken(said) if command else said
-        return _fail(said, 1 if isinstance(error, ArithmeticError) else 2)
+        return _fail(said, 1 if isinstance(error, ArithmeticError | ConnectionError) else 2)
     except ModuleNotFoundError as error:
         return _missing(error)
     except KeyboardInterrupt:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,9 @@ def train_command(
     found in it, and said. A few models are tried, the best on validation is trained forward and
     backward, and blended with simple predictors so that the answers lose to none of these.
 
+    Started by torchrun, all ranks train one model, which has to be given: each takes its part of
+    every batch, and the first one writes the run.
+
     Args:
         data: the log, of any format that Offbeat reads.
         out: folder of the run: config.yaml, log.csv, checkpoints, models, blend, results.json. A
@@ -67,6 +71,7 @@ def train_command(
     from offbeat.cli.scored import scored
     from offbeat.data.scaler import SCALERS
     from offbeat.data.splits import save_split
+    from offbeat.distributed import group, is_first
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
     from offbeat.learning import learn
@@ -101,10 +106,10 @@ def train_command(
             print(f"offbeat: {note}", file=sys.stderr)
     as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
     open_model = model == ModelConfig()
-    with locked(out):
+    with group(device) as ranks, locked(out) if is_first() else nullcontext():
         learned = learn(
             dataset,
-            out,
+            out if is_first() else None,
             horizon_s=horizon_s,
             model=None if open_model and not as_it_is else model,
             training=config,
@@ -118,6 +123,8 @@ def train_command(
             seed=seed,
             device=device,
         )
+        if ranks is not None and not ranks.first:
+            return
         for note in learned.notes[len(() if chosen is None else chosen.notes) :]:
             print(f"offbeat: {note}", file=sys.stderr)
         blend, made = learned.blend, learned.blend.forward

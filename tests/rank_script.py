@@ -1,0 +1,52 @@
+"""One training by the ranks that started this script: `rank_script.py OUT EPOCHS MODELS [LOST]`."""
+
+import os
+import sys
+
+import numpy as np
+import torch
+from model_helpers import dataset
+
+import offbeat as ob
+from offbeat.distributed import group
+
+folder, epochs, names, *lost = sys.argv[1:]
+data = ob.mask_out(dataset(11), 0.6, seed=0)
+train, validation = data[:8], data[8:]
+torch.set_num_threads(1)
+
+
+class Ends:
+    """Ends this process in the second epoch, as a machine that fails does."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def __call__(self):
+        self.steps += 1
+        if self.steps == 5:
+            os._exit(7)
+
+
+try:
+    with group(timeout_s=60) as ranks:
+        rank = 0 if ranks is None else ranks.rank
+        for name in names.split(","):
+            config = ob.TrainConfig(
+                epochs=int(epochs),
+                batch_size=3,  # and two in the last step
+                clip_norm=0.5,
+                keep="last",
+                redraw=ob.RedrawConfig((0.5, 0.8)) if name == "gru" else None,
+                loss="relative" if name == "gru_d" else None,
+            )
+            model = ob.make_model(name, train, hidden_size=4)
+            if lost and rank == int(lost[0]):
+                step, run = Ends(), model.run
+                model.run = lambda *a, run=run, step=step, **k: (step(), run(*a, **k))[1]
+            ob.fit(model, train, validation, config, out=f"{folder}/{name}", progress=False)
+            flat = torch.cat([p.detach().reshape(-1) for p in model.parameters()])
+            np.save(f"{folder}/{name}-weights-{rank}.npy", flat.numpy())
+except ob.OffbeatError as error:
+    print(f"{type(error).__name__}: {error}", file=sys.stderr)
+    sys.exit(3)
