@@ -11,7 +11,8 @@ gymnasium = pytest.importorskip("gymnasium")
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from offbeat.env import Outages, UnevenObservations  # noqa: E402
+from offbeat.data.drops import Outages  # noqa: E402
+from offbeat.env import UnevenObservations  # noqa: E402
 
 EVERYTHING = {
     "drop": 0.4,

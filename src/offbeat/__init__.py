@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from offbeat.models.model import Model
     from offbeat.models.zoo import list_models, make_model, register_model
     from offbeat.parts import Prediction, register_part
+    from offbeat.policies import Policy, fit_policy
     from offbeat.stream.options import StreamOptions
     from offbeat.stream.stream import Stream
     from offbeat.sweeps.sweep import sweep
@@ -65,6 +66,7 @@ _PUBLIC = {
     "FitResult": "training",
     "Model": "models.model",
     "OnnxStream": "export.runner",
+    "Policy": "policies",
     "Prediction": "parts",
     "Scaler": "data.scaler",
     "Scores": "metrics",
@@ -78,6 +80,7 @@ _PUBLIC = {
     "fit": "training",
     "fit_backward": "answers.backward",
     "fit_blend": "answers.blend",
+    "fit_policy": "policies",
     "forecast": "answers.forecast",
     "from_pandas": "data.frames",
     "impute": "answers.impute",
@@ -162,6 +165,7 @@ __all__ = [
     "ModelConfig",
     "OffbeatError",
     "OnnxStream",
+    "Policy",
     "Prediction",
     "RedrawConfig",
     "Scaler",
@@ -180,6 +184,7 @@ __all__ = [
     "fit",
     "fit_backward",
     "fit_blend",
+    "fit_policy",
     "forecast",
     "from_pandas",
     "impute",

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.errors import InputError, require
+from offbeat.data.drops import Outages, check_fraction, check_seconds
+from offbeat.errors import InputError, MissingExtraError, require
 
 gymnasium: Any = require("gymnasium", "robots")
 
@@ -104,14 +105,14 @@ class UnevenObservations(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArg
                 f"observations must be a Box, got {space}; wrap the environment with "
                 "gymnasium.wrappers.FlattenObservation first"
             )
-        self.dt = time_step(env) if dt is None else _seconds("dt", dt)
+        self.dt = time_step(env) if dt is None else check_seconds("dt", dt)[0]
         if self.dt <= 0:
             raise InputError(f"dt must be positive, got {dt!r}")
-        self._drop = _fraction("drop", drop)
-        self._sensor_drop = _fraction("sensor_drop", sensor_drop)
+        self._drop = check_fraction("drop", drop)
+        self._sensor_drop = check_fraction("sensor_drop", sensor_drop)
         self._outages = Outages(bursts, burst_s)
-        self._delay = _pair("delay_s", delay_s)
-        self._jitter = _seconds("jitter_s", jitter_s)
+        self._delay = check_seconds("delay_s", delay_s)
+        self._jitter = check_seconds("jitter_s", jitter_s)[0]
         if not self._jitter < self.dt / 2:
             raise InputError(
                 f"jitter_s must be less than half a step of {self.dt:g} s, so that stamps stay in "
@@ -213,42 +214,28 @@ class UnevenObservations(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArg
         }
 
 
-class Outages:
-    """Outages of random lengths, with pauses whose lengths are exponential.
+def make(name: str) -> Any:
+    """An environment of Gymnasium by its name.
 
     Args:
-        fraction: of the time in outages, 0 or more and less than 1.
-        length_s: s, shortest and longest outage.
+        name: such as `Hopper-v5`.
 
     Raises:
-        InputError: an argument is out of its range.
+        InputError: there is none of this name.
+        MissingExtraError: a package that it needs is not installed.
     """
-
-    def __init__(self, fraction: float, length_s: tuple[float, float]) -> None:
-        self.fraction = _fraction("bursts", fraction)
-        self.low, self.high = _pair("burst_s", length_s)
-        if self.fraction and not self.high > 0:
-            raise InputError(f"burst_s must be longer than 0 s, got {length_s!r}")
-        self.reset()
-
-    def reset(self) -> None:
-        """Begins at 0 s, without an outage."""
-        self._begin = self._end = 0.0
-
-    def at(self, time: float, random: np.random.Generator) -> bool:
-        """Whether a time is in an outage.
-
-        Args:
-            time: s, not before the time of the last call.
-            random: that outages are drawn from.
-        """
-        if not self.fraction:
-            return False
-        pause = (self.low + self.high) / 2 * (1 - self.fraction) / self.fraction
-        while time >= self._end:
-            self._begin = self._end + random.exponential(pause)
-            self._end = self._begin + random.uniform(self.low, self.high)
-        return time >= self._begin
+    try:
+        return gymnasium.make(name)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise MissingExtraError(
+            f"the environment {name!r} needs a package that is not installed "
+            f"({' '.join(str(error).split())}); install it with: pip install 'offbeat[robots]'"
+        ) from None
+    except gymnasium.error.Error as error:
+        what = " ".join(str(error).split())
+        raise InputError(
+            f"Gymnasium has no environment {name!r} ({what}); give a name such as Hopper-v5"
+        ) from None
 
 
 def time_step(env: Any) -> float:
@@ -265,25 +252,6 @@ def time_step(env: Any) -> float:
         if isinstance(value, int | float) and 0 < value < math.inf:
             return float(value)
     raise InputError(f"{env} does not say how long a step is; give dt, in seconds")
-
-
-def _fraction(name: str, value: float) -> float:
-    if not 0 <= value < 1:
-        raise InputError(f"{name} must be a fraction of at least 0 and less than 1, got {value!r}")
-    return float(value)
-
-
-def _seconds(name: str, value: float) -> float:
-    if not 0 <= value < math.inf:
-        raise InputError(f"{name} must be seconds of at least 0, got {value!r}")
-    return float(value)
-
-
-def _pair(name: str, value: float | tuple[float, float]) -> tuple[float, float]:
-    low, high = value if isinstance(value, tuple | list) else (value, value)
-    if not 0 <= low <= high < math.inf:
-        raise InputError(f"{name} must be seconds of at least 0, low before high, got {value!r}")
-    return float(low), float(high)
 
 
 def _groups(sensors: Sequence[Sequence[int]] | None, channels: int) -> list[NDArray[np.int64]]:

@@ -165,7 +165,7 @@ class Batch:
         return replace(
             self,
             values=torch.where(acts, values, self.values),
-            mask=torch.where(acts, mask, self.mask),
+            mask=(mask & acts) | (self.mask & ~acts),
         )
 
     def to(

@@ -60,26 +60,55 @@ def export_onnx(model: BaseModel | Blend, path: str | Path) -> None:
             baseline that does not run on torch tensors; or another suffix.
         MissingExtraError: onnx or onnxscript is not installed.
     """
+    forward = model.forward if isinstance(model, Blend) else model
+    inner = None if forward is None else exportable(forward)
+    if inner is not None and inner.acts:
+        raise InputError(
+            "a model with actions is exported as a policy (offbeat.policies.export_policy), or "
+            "streamed with offbeat.Stream"
+        )
+    step = BlendStep(model) if isinstance(model, Blend) else _step_of(model)
+    write_step(step, inner, _record(model, step.initial()), path, blend=model)
+
+
+def write_step(
+    step: Step,
+    inner: Model | None,
+    record: dict[str, Any],
+    path: str | Path,
+    *,
+    blend: Any = None,
+) -> None:
+    """Writes a step as an ONNX file.
+
+    Args:
+        step: to trace.
+        inner: the model that it runs, from `exportable`.
+        record: JSON-like metadata.
+        path: .onnx file, written atomically.
+        blend: whose baselines are named where they cannot be traced.
+
+    Raises:
+        InputError: another suffix, or a baseline that cannot be traced.
+        MissingExtraError: onnx or onnxscript is not installed.
+    """
     path = Path(path)
     one_of("suffix of an ONNX file", path.suffix, (".onnx",))
-    forward = model.forward if isinstance(model, Blend) else model
-    inner = None if forward is None else _exportable(forward)
     onnx = require("onnx", "export")
     optimizer: Any = require("onnxscript.optimizer", "export")
-    step = BlendStep(model) if isinstance(model, Blend) else _step_of(model)
     with torch.no_grad(), _quiet(), nullcontext() if inner is None else _traceable(inner):
         try:
             program = _traced(step)
         except Exception:
-            if isinstance(model, Blend):
-                _check_members(model)
+            if isinstance(blend, Blend):
+                _check_members(blend)
             raise
     # All but its rule for nested bounds, which can refer to a constant that it does not add.
     optimizer.fold_constants(program.model)
     optimizer.remove_unused_nodes(program.model)
     proto = program.model_proto
     entry = proto.metadata_props.add()
-    entry.key, entry.value = METADATA, json.dumps(_record(model, step.initial()), allow_nan=False)
+    entry.key, entry.value = METADATA, json.dumps(record, allow_nan=False)
     onnx.checker.check_model(proto)
     with atomic_path(path) as temporary:
         temporary.write_bytes(proto.SerializeToString())
@@ -295,7 +324,7 @@ class BlendStep(Step):
 
 
 def _step_of(model: BaseModel) -> Step:
-    """The step of a model that `_exportable` accepts."""
+    """The step of a model that `exportable` accepts."""
     if isinstance(model, CorrectedModel):
         return CorrectedStep(model)
     assert isinstance(model, Model)
@@ -416,16 +445,21 @@ def _record(model: BaseModel | Blend, initial: dict[str, Tensor]) -> dict[str, A
     }
 
 
-def _exportable(model: BaseModel) -> Model:
-    """The model itself, or the one that corrects a baseline, if a graph can hold its step."""
+def exportable(model: BaseModel) -> Model:
+    """The model itself, or the one that corrects a baseline, if a graph can hold its step.
+
+    Args:
+        model: any.
+
+    Raises:
+        InputError: a graph cannot.
+    """
     model = model.inner if isinstance(model, CorrectedModel) else model
     if not isinstance(model, Model):
         raise InputError(
             f"the model {model.name!r} has no recurrent state, so no step to export; stream it "
             "with offbeat.Stream"
         )
-    if model.acts:
-        raise InputError("a model with actions cannot be exported; stream it with offbeat.Stream")
     if model.config.self_feeding:
         raise InputError(
             "a model with self_feeding draws random numbers at every row, which a graph cannot; "

@@ -1,0 +1,1 @@
+"""Policies cloned from uneven demonstrations: experts, rivals and their results."""

@@ -1,0 +1,319 @@
+"""`Policy`: a model that chooses actions from observations as they arrive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from offbeat.data.batch import Batch
+from offbeat.data.trajectory import ACTION
+from offbeat.errors import InputError
+from offbeat.models.base import BaseModel
+from offbeat.models.checkpoint import load_model
+from offbeat.models.elapsed import RecurrentState
+from offbeat.models.model import Model
+
+State = dict[str, NDArray[Any]]
+"""The state of a policy, by the names of its parts."""
+
+
+class Policy:
+    """Chooses actions from observations at uneven times, with frames and sensors missing.
+
+    A policy sees no actions, not even its own: clones that do tend to repeat their last one.
+
+    Args:
+        model: from `fit_policy`, or any model with channels of the role `action`. One without a
+            recurrent state is run on its newest `window` rows.
+        window: rows that are kept of a model without a recurrent state.
+
+    Raises:
+        InputError: no channel of the model is an action, or it has input transforms.
+
+    Example:
+        >>> policy.reset()  # doctest: +SKIP
+        >>> policy.act(0.00, {"angle": 0.3, "speed": 0.0})  # doctest: +SKIP
+        >>> policy.act(0.05)  # nothing was observed  # doctest: +SKIP
+    """
+
+    def __init__(self, model: BaseModel, *, window: int = 64) -> None:
+        acts = np.array([role == ACTION for role in model.roles])
+        if not acts.any() or acts.all():
+            raise InputError(
+                "a policy needs a model with observations and actions, got the roles "
+                f"{', '.join(model.roles)}; give channels the role 'action'"
+            )
+        if not model.transforms.is_identity:
+            raise InputError(
+                "a policy takes no input transforms; read the demonstrations without them "
+                "(unwrap=False), and give angles as sine and cosine"
+            )
+        self.model, self.window = model, window
+        self.observations = tuple(np.array(model.names)[~acts].tolist())
+        """Names of the observed channels, in order."""
+        self.actions = tuple(np.array(model.names)[acts].tolist())
+        """Names of the actions, in order."""
+        shift, scale = model.scaler.shift[acts], np.abs(model.scaler.scale[acts])
+        self.low, self.high = shift - scale, shift + scale
+        """(actions,) bounds of the actions, in their units."""
+        self.log: tuple[Any, ...] = ()
+        """A record per epoch of its cloning; empty for a policy that was loaded."""
+        self._seen, self._acts = np.flatnonzero(~acts), torch.from_numpy(np.flatnonzero(acts))
+        self.reset()
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether the model has a recurrent state."""
+        return isinstance(self.model, Model)
+
+    def reset(self, n: int | None = None) -> None:
+        """Begins an episode.
+
+        Args:
+            n: number of robots that are driven together, each an episode; by default one, whose
+                observations and actions have no first axis.
+        """
+        if n is not None and (isinstance(n, bool) or not isinstance(n, int) or n < 1):
+            raise InputError(f"n must be a number of robots, got {n!r}")
+        self.n = n
+        self._time = np.full(n or 1, -np.inf)
+        self._past: RecurrentState | Batch | None = None
+        if isinstance(self.model, Model):
+            self._past = self.model.empty_state(n or 1)
+
+    def act(
+        self,
+        t: ArrayLike,
+        observation: ArrayLike | Mapping[str, float] | None = None,
+        mask: ArrayLike | None = None,
+        *,
+        now: ArrayLike | None = None,
+    ) -> NDArray[np.float64]:
+        """The actions at a time, from everything observed by then.
+
+        Args:
+            t: s since any fixed origin, of the observation; (n,) where robots differ.
+            observation: (observations,) in the units of the demonstrations, or by name; NaN where
+                not measured. With `n` robots (n, observations). By default nothing was observed.
+            mask: as the observation, true where measured.
+            now: s, at which the robot acts, where the observation is older; (n,) where they differ.
+
+        Returns:
+            (actions,) in the units of the demonstrations, within their bounds; with `n` robots
+            (n, actions).
+
+        Raises:
+            InputError: a shape or a name is wrong, or a time is before the one of the last call.
+        """
+        count = self.n or 1
+        values, seen = self._row(observation, mask)
+        stamp = _times("t", t, count)
+        asked = stamp if now is None else _times("now", now, count)
+        stamp = np.where(seen.any(axis=1), stamp, asked)
+        if (stamp < self._time).any() or (asked < stamp).any():
+            raise InputError(
+                f"times must not decrease, got an observation of {stamp.tolist()} s and an action "
+                f"at {asked.tolist()} s after {self._time.tolist()} s; reset() begins an episode"
+            )
+        times = stamp[:, None]
+        if (asked > stamp).any():  # a row in which nothing is observed
+            times = np.stack([stamp, asked], axis=1)
+            values = np.stack([values, np.zeros_like(values)], axis=1)
+            seen = np.stack([seen, np.zeros_like(seen)], axis=1)
+        else:
+            values, seen = values[:, None], seen[:, None]
+        chosen = self._forward(times, values, seen)
+        self._time = asked
+        return chosen if self.n is not None else chosen[0]
+
+    def select_action(self, batch: Mapping[str, Any]) -> Tensor:
+        """The actions of a batch in LeRobot's form.
+
+        Args:
+            batch: `observation.state` (n, observations) or (observations,), NaN where not measured;
+                `timestamp`, s, (n,) or a number, by default one typical step after the last call;
+                and `observation.mask`, true where measured, by default everything that is finite.
+
+        Returns:
+            (n, actions) float32.
+
+        Raises:
+            InputError: there is no `observation.state`, or as `act`.
+        """
+        if "observation.state" not in batch:
+            raise InputError(
+                f"the batch has {', '.join(sorted(batch)) or 'nothing'}, expected observation.state"
+            )
+        state = np.atleast_2d(_array("observation.state", batch["observation.state"]))
+        if self.n != len(state):
+            self.reset(len(state))
+        t = batch.get("timestamp")
+        if t is None:
+            t = np.where(np.isfinite(self._time), self._time + self.model.statistics.median_gap, 0)
+        mask = batch.get("observation.mask")
+        if mask is not None:
+            mask = np.broadcast_to(np.asarray(mask), state.shape)
+        chosen = self.act(_array("timestamp", t).reshape(-1), state, mask)
+        return torch.from_numpy(chosen.astype(np.float32))
+
+    def state(self) -> State:
+        """The state of the episode as plain arrays; `restore` goes on from it bit for bit."""
+        past, arrays = self._past, {"at": self._time.copy()}
+        for field in fields(past) if past is not None else ():
+            value = getattr(past, field.name)
+            if isinstance(value, Tensor):
+                arrays[field.name] = value.cpu().numpy().copy()
+        if isinstance(past, RecurrentState):
+            arrays["rows"] = np.array(past.rows)
+        return arrays
+
+    def restore(self, state: State) -> None:
+        """Goes on from the state of an episode of the same model.
+
+        Args:
+            state: from `state`.
+
+        Raises:
+            InputError: it is of another model. The policy has not changed then.
+        """
+        at = state.get("at")
+        if at is None or at.ndim != 1:
+            raise InputError("this is no state of a policy (it has no array 'at')")
+        fresh = Policy(self.model, window=self.window)
+        fresh.reset(len(at) if self.n is not None or len(at) > 1 else None)
+        names = {k: v for k, v in state.items() if k not in ("at", "rows")}
+        if isinstance(fresh._past, RecurrentState):
+            expected = {
+                f.name: getattr(fresh._past, f.name)
+                for f in fields(fresh._past)
+                if isinstance(getattr(fresh._past, f.name), Tensor)
+            }
+            wrong = expected.keys() ^ names.keys() or [
+                name for name, tensor in expected.items() if tensor.shape != names[name].shape
+            ]
+            if wrong:
+                raise InputError(f"the state is of another model: it differs in {sorted(wrong)}")
+            device = self.model.device
+            parts: dict[str, Any] = {k: torch.tensor(v, device=device) for k, v in names.items()}
+            self._past = replace(fresh._past, rows=int(state["rows"]), **parts)
+        elif names:
+            tensors: dict[str, Any] = {k: torch.tensor(v) for k, v in names.items()}
+            if tensors["values"].shape[2] != self.model.channels:
+                raise InputError("the state is of a model with other channels")
+            self._past = Batch(**tensors, roles=self.model.roles)
+        else:
+            self._past = None
+        self.n, self._time = fresh.n, at.copy()
+
+    def save(self, path: str | Path) -> None:
+        """Writes the policy to a folder, atomically, as a checkpoint of its model.
+
+        Args:
+            path: the folder; an existing one is replaced.
+        """
+        self.model.save(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Policy:
+        """Reads a policy; nothing is unpickled.
+
+        Args:
+            path: folder of `save`, or of any model with actions.
+
+        Raises:
+            FileFormatError: as `load_model`.
+            InputError: the model has no actions.
+        """
+        return cls(load_model(path))
+
+    def __repr__(self) -> str:
+        return (
+            f"Policy({self.model.name}: {len(self.observations)} observations to "
+            f"{len(self.actions)} actions)"
+        )
+
+    def _row(self, observation: Any, mask: Any) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """(n, observations) values and masks, 0 and False where not measured."""
+        shape = (self.n or 1, len(self.observations))
+        if observation is None:
+            return np.zeros(shape), np.zeros(shape, dtype=bool)
+        if isinstance(observation, Mapping):
+            unknown = sorted(set(observation) - set(self.observations))
+            if unknown:
+                raise InputError(
+                    f"unknown observation {unknown[0]!r}, expected: {', '.join(self.observations)}"
+                )
+            observation = [observation.get(name, np.nan) for name in self.observations]
+        values = _array("observation", observation)
+        expected = shape if self.n is not None else shape[1:]
+        if values.shape != expected:
+            raise InputError(f"an observation must have the shape {expected}, got {values.shape}")
+        seen = np.isfinite(values)
+        if mask is not None:
+            given = np.asarray(mask)
+            if given.shape != expected:
+                raise InputError(f"a mask must have the shape {expected}, got {given.shape}")
+            seen &= given.astype(bool)
+        return np.where(seen, values, 0.0).reshape(shape), seen.reshape(shape)
+
+    def _forward(
+        self, times: NDArray[np.float64], values: NDArray[np.float64], seen: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        """(n, actions) at the last of some rows, which become the past."""
+        model, shape = self.model, (*values.shape[:2], self.model.channels)
+        scaler = model.scaler
+        scaled, mask = np.zeros(shape), np.zeros(shape, dtype=bool)
+        scaled[..., self._seen] = (values - scaler.shift[self._seen]) / scaler.scale[self._seen]
+        mask[..., self._seen] = seen
+        given = torch.from_numpy(np.where(mask, scaled, 0.0)).to(model.device, model.dtype)
+        observed = torch.from_numpy(mask).to(model.device)
+        valid = torch.ones(shape[:2], dtype=torch.bool, device=model.device)
+        row = Batch(
+            torch.from_numpy(times).to(model.device), given, observed, observed, valid, model.roles
+        )
+        with torch.inference_mode():
+            if isinstance(model, Model):
+                assert isinstance(self._past, RecurrentState)
+                output = model(row, past=self._past)
+                # It sees no actions, so none are kept.
+                self._past = replace(output.past, actions=None)
+            else:
+                assert not isinstance(self._past, RecurrentState)
+                self._past = _joined(self._past, row, self.window)
+                output = model(self._past)
+            chosen = output.mean[:, -1].double().cpu().index_select(1, self._acts).numpy()
+        acts = self._acts.numpy()
+        chosen = chosen * scaler.scale[acts] + scaler.shift[acts]
+        return np.asarray(np.clip(chosen, self.low, self.high))
+
+
+def _joined(past: Batch | None, row: Batch, window: int) -> Batch:
+    """The newest rows of some and further ones."""
+    if past is None:
+        return row
+    parts: dict[str, Any] = {
+        name: torch.cat([getattr(past, name), getattr(row, name)], dim=1)[:, -window:]
+        for name in ("times", "values", "mask", "known", "valid")
+    }
+    return replace(row, **parts)
+
+
+def _times(name: str, value: ArrayLike, count: int) -> NDArray[np.float64]:
+    times = _array(name, value).reshape(-1)
+    if len(times) not in (1, count) or not np.isfinite(times).all():
+        raise InputError(f"{name} must be a finite time in seconds, or {count} of them: {value!r}")
+    return np.array(np.broadcast_to(times, (count,)))
+
+
+def _array(name: str, value: Any) -> NDArray[np.float64]:
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be numbers: {error}") from None

@@ -1,0 +1,442 @@
+"""Policies: what each must hold to, and a small cloning."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import offbeat as ob
+from offbeat.data.drops import Drops
+from offbeat.data.trajectory import ACTION
+from offbeat.parts import Prediction
+from offbeat.policies import (
+    CloneConfig,
+    HeldController,
+    OnnxPolicy,
+    Policy,
+    demonstrate,
+    export_policy,
+    fit_policy,
+    rollout,
+)
+
+NAMES = ("angle", "speed", "push")
+ROLES = ("state", "state", "action")
+MODELS = ("gru", "gru_d", "ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "anchored_trend")
+SMALL = {"hidden_size": 6, "decoder_units": (8,), "field_units": (8,)}
+
+
+def demonstrations(count: int = 6, rows: int = 40) -> ob.Dataset:
+    """A swing, and a push against its angle and its speed."""
+    made = []
+    for i in range(count):
+        random = np.random.default_rng(i)
+        times = 5.0 + np.cumsum(random.uniform(0.02, 0.08, rows))
+        angle = np.sin(3 * times + i)
+        speed = 3 * np.cos(3 * times + i)
+        push = np.clip(-angle - 0.3 * speed, -1, 1)
+        values = np.stack([angle, speed, push], axis=1)
+        made.append(ob.Trajectory(times, values, names=NAMES, roles=ROLES))
+    return ob.Dataset(tuple(made))
+
+
+def small(name: str = "anchored_ode_gru_d", **options) -> Policy:
+    config = CloneConfig(epochs=1, window=20, loss=options.pop("loss", "mse"))
+    policy = fit_policy(
+        demonstrations(), name, config=config, progress=False, **{**SMALL, **options}
+    )
+    policy.model.double()
+    policy.reset()
+    return policy
+
+
+def episode(seed: int = 0, rows: int = 25):
+    """Times, observations and masks, frames and sensors missing."""
+    random = np.random.default_rng(seed)
+    times = 3.0 + np.cumsum(random.uniform(0.01, 0.2, rows))
+    mask = (random.random((rows, 2)) < 0.7) & (random.random((rows, 1)) < 0.6)
+    mask[0] = True
+    return times, random.normal(size=(rows, 2)), mask
+
+
+def acted(policy, times, values, masks):
+    return np.array([policy.act(t, v, m) for t, v, m in zip(times, values, masks, strict=True)])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_row_by_row_is_the_model_on_the_whole_episode(name):
+    policy = small(name)
+    times, values, masks = episode()
+    whole = np.concatenate([values, np.zeros((len(times), 1))], axis=1)
+    seen = np.concatenate([masks, np.zeros((len(times), 1), dtype=bool)], axis=1)
+    trajectory = ob.Trajectory(times, whole, observed=seen, names=NAMES, roles=ROLES)
+    model = policy.model
+    with torch.no_grad():
+        predicted = model(model.batch(ob.Dataset((trajectory,)))).mean[0].numpy()
+    expected = model.scaler.original(predicted)[:, 2:]
+    assert np.allclose(acted(policy, times, values, masks), expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_an_action_depends_on_the_past_and_the_observation_of_its_row_alone(name):
+    policy = small(name)
+    times, values, masks = episode()
+    before = acted(policy, times, values, masks)
+    row = 12
+    masks = masks.copy()
+    masks[row] = True
+    policy.reset()
+    with_row = acted(policy, times, values, masks)
+    changed = values.copy()
+    changed[row] += 1.0
+    changed[~masks] += 100.0  # what is not measured is not looked at
+    policy.reset()
+    after = acted(policy, times, changed, masks)
+    assert np.array_equal(with_row[:row], before[:row])
+    assert np.array_equal(after[:row], with_row[:row])
+    assert np.abs(after[row] - with_row[row]).max() > 1e-9
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_missing_observations_are_accepted_in_every_form(name):
+    policy = small(name)
+    policy.act(0.0, {"angle": 0.4, "speed": 0.1})
+    state = policy.state()
+    forms = ((), (None,), ([np.nan, np.nan],), ([7.0, 8.0], [False, False]), ({},))
+    chosen = []
+    for form in forms:
+        policy.restore(state)
+        chosen.append(policy.act(0.1, *form))
+    assert all(np.array_equal(one, chosen[0]) for one in chosen)
+    policy.restore(state)
+    partly = policy.act(0.1, {"speed": -2.0})
+    policy.restore(state)
+    assert np.array_equal(partly, policy.act(0.1, [5.0, -2.0], [0, 1]))
+    assert not np.array_equal(partly, chosen[0])
+    policy.reset()
+    assert np.isfinite(policy.act(0.0)).all()  # nothing was ever observed
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_asking_without_an_observation_changes_no_later_action(name):
+    policy = small(name)
+    times, values, masks = episode()
+    expected = acted(policy, times, values, masks)
+    policy.reset()
+    for row, time in enumerate(times):
+        if row:
+            policy.act((time + times[row - 1]) / 2)
+        chosen = policy.act(time, values[row], masks[row])
+        assert np.allclose(chosen, expected[row], atol=1e-12)
+
+
+def test_an_observation_that_is_late_is_placed_at_its_stamp():
+    policy = small()
+    policy.act(0.0, [0.1, 0.2])
+    policy.act(0.3, [0.5, 0.6])
+    expected = policy.act(0.4)
+    policy.reset()
+    policy.act(0.0, [0.1, 0.2])
+    assert np.array_equal(policy.act(0.3, [0.5, 0.6], now=0.4), expected)
+
+
+@pytest.mark.parametrize("loss", ["mse", "nll"])
+@pytest.mark.parametrize("name", ["gru", "anchored_ode_gru_d"])
+def test_actions_stay_within_their_bounds_whatever_is_observed(name, loss):
+    policy = small(name, bounds=([-0.5], [2.0]), loss=loss)
+    assert (policy.low, policy.high) == (-0.5, 2.0)
+    with torch.no_grad():
+        for parameter in policy.model.parameters():
+            parameter.mul_(30)
+    chosen = acted(policy, np.arange(50.0), 1e6 * np.random.default_rng(0).normal(size=(50, 2)),
+                   np.ones((50, 2)))  # fmt: skip
+    assert (chosen >= -0.5).all()
+    assert (chosen <= 2.0).all()
+    assert np.ptp(chosen) > 0.1
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_several_robots_together_are_each_alone(name):
+    policy = small(name)
+    episodes = [episode(seed) for seed in range(3)]
+    alone = []
+    for times, values, masks in episodes:
+        policy.reset()
+        alone.append(acted(policy, times, values, masks))
+    policy.reset(3)
+    for row in range(25):
+        t, v, m = (np.stack([one[part][row] for one in episodes]) for part in range(3))
+        assert np.allclose(policy.act(t, v, m), [one[row] for one in alone], atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["gru_d", "anchored_trend"])
+def test_saved_and_loaded_a_policy_acts_the_same_bit_for_bit(name, tmp_path):
+    policy = small(name)
+    policy.save(tmp_path / "policy")
+    loaded = Policy.load(tmp_path / "policy")
+    assert (loaded.observations, loaded.actions) == (("angle", "speed"), ("push",))
+    assert np.array_equal(acted(policy, *episode()), acted(loaded, *episode()))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_state_goes_on_bit_for_bit_also_in_another_policy(name, tmp_path):
+    policy = small(name)
+    times, values, masks = episode()
+    acted(policy, times[:10], values[:10], masks[:10])
+    np.savez(tmp_path / "state.npz", **policy.state())
+    expected = acted(policy, times[10:], values[10:], masks[10:])
+    with np.load(tmp_path / "state.npz") as state:
+        other = Policy(policy.model)
+        other.restore(dict(state))
+    assert np.array_equal(acted(other, times[10:], values[10:], masks[10:]), expected)
+    with pytest.raises(ob.InputError, match="state is of another model"):
+        small("gru" if name != "gru" else "ode_rnn", hidden_size=7).restore(other.state())
+
+
+@pytest.mark.parametrize("name", ["ode_gru_d", "anchored_trend"])
+def test_the_onnx_file_acts_as_the_policy(name, tmp_path):
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    policy = small(name, bounds=([-2.0], [1.0]))
+    export_policy(policy, tmp_path / "policy.onnx")
+    other = OnnxPolicy(tmp_path / "policy.onnx")
+    assert (other.observations, other.actions) == (policy.observations, policy.actions)
+    times, values, masks = episode()
+    expected = acted(policy, times, values, masks)
+    assert np.allclose(acted(other, times, values, masks), expected, atol=1e-9)
+    state = other.state()
+    one = other.act(times[-1] + 0.1)
+    other.restore(state)
+    assert np.array_equal(other.act(times[-1] + 0.1), one)
+    assert np.allclose(one, policy.act(times[-1] + 0.1), atol=1e-9)
+
+
+def test_a_file_that_is_no_policy_is_refused(tmp_path):
+    pytest.importorskip("onnxruntime")
+    (tmp_path / "bad.onnx").write_bytes(b"no graph")
+    with pytest.raises(ob.FileFormatError, match="not a policy that export_policy wrote"):
+        OnnxPolicy(tmp_path / "bad.onnx")
+
+
+def test_lerobots_form_is_act():
+    policy = small()
+    batch = {"observation.state": torch.tensor([[0.1, 0.2], [0.3, np.nan]]), "timestamp": 0.5}
+    chosen = policy.select_action(batch)
+    assert chosen.shape == (2, 1)
+    assert chosen.dtype == torch.float32
+    policy.reset(2)
+    expected = policy.act(0.5, batch["observation.state"].numpy())
+    assert np.allclose(chosen.numpy(), expected)
+    later = policy.select_action({"observation.state": batch["observation.state"]})
+    assert later.shape == (2, 1)
+    with pytest.raises(ob.InputError, match=r"expected observation\.state"):
+        policy.select_action({"state": 1})
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: p.act(1.0, [1.0]), r"must have the shape \(2,\), got \(1,\)"),
+        (lambda p: p.act(1.0, [1.0, 2.0], [True]), "a mask must have the shape"),
+        (lambda p: p.act(1.0, {"hip": 1.0}), "unknown observation 'hip'"),
+        (lambda p: p.act(np.nan), "t must be a finite time"),
+        (lambda p: p.act(1.0, "now"), "observation must be numbers"),
+        (lambda p: (p.act(1.0), p.act(0.5)), "times must not decrease"),
+        (lambda p: p.act(1.0, [1.0, 1.0], now=0.5), "times must not decrease"),
+        (lambda p: p.reset(0), "n must be a number of robots"),
+        (lambda p: p.restore({}), "no state of a policy"),
+    ],
+)
+def test_a_wrong_call_says_what_was_expected(call, message):
+    with pytest.raises(ob.InputError, match=message):
+        call(small("gru"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bounds": ([1.0], [1.0])}, "bounds must be finite, the lowest below"),
+        ({"bounds": ([1.0, 2.0], [3.0, 4.0])}, "two arrays of 1 actions"),
+        ({"sensors": [["hip"]]}, "unknown observation 'hip'"),
+    ],
+)
+def test_a_wrong_option_of_a_cloning_says_what_was_expected(change, message):
+    with pytest.raises(ob.InputError, match=message):
+        fit_policy(demonstrations(), "gru", progress=False, **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"loss": "mae"}, "unknown loss of actions 'mae'"),
+        ({"epochs": 0}, "epochs must be an integer"),
+        ({"window": 1}, "window must be at least 2 rows"),
+        ({"learning_rate": -1.0}, "learning_rate must be a positive"),
+        ({"observation_weight": -1.0}, "observation_weight must be at least 0"),
+    ],
+)
+def test_a_wrong_config_is_refused(change, message):
+    with pytest.raises(ob.InputError, match=message):
+        CloneConfig(**change)
+
+
+def test_demonstrations_without_actions_or_without_observations_are_refused():
+    for names in (NAMES[:2], NAMES[2:]):
+        with pytest.raises(ob.InputError, match="need observations and actions"):
+            fit_policy(demonstrations().select(names), "gru", progress=False)
+    model = ob.make_model("gru", demonstrations().select(NAMES[:2]))
+    with pytest.raises(ob.InputError, match="needs a model with observations and actions"):
+        Policy(model)
+
+
+def test_the_same_seed_clones_the_same_policy_and_the_best_epoch_is_kept():
+    config = CloneConfig(epochs=4, window=20, seed=3, learning_rate=0.05)
+    one, same = (
+        fit_policy(demonstrations(), "gru", validation=demonstrations(9), config=config,
+                   drops=Drops(0.5, 0.3, 0.3), progress=False, **SMALL)
+        for _ in range(2)
+    )  # fmt: skip
+    assert np.array_equal(acted(one, *episode()), acted(same, *episode()))
+    assert [r.epoch for r in one.log] == [1, 2, 3, 4]
+    assert all(np.isfinite(r.validation) for r in one.log)
+
+
+class Held(torch.nn.Module):
+    """A registered module: the action from the last value of each channel."""
+
+    def __init__(self, data, width=16):
+        super().__init__()
+        self.acts = torch.tensor([role == ACTION for role in data.roles])
+        self.layers = torch.nn.Sequential(
+            torch.nn.Linear(data.channels, width),
+            torch.nn.Tanh(),
+            torch.nn.Linear(width, width),
+            torch.nn.Tanh(),
+            torch.nn.Linear(width, data.channels),
+            torch.nn.Tanh(),
+        )
+
+    def forward(self, batch):
+        before = ob.last_values(batch.values, batch.mask, before=torch.zeros(batch.channels))
+        held = torch.where(batch.mask, batch.values, before)
+        return Prediction(torch.where(self.acts, self.layers(held), before))
+
+
+@pytest.fixture
+def held_model():
+    from offbeat.models.zoo import MODELS
+
+    ob.register_model("held_policy", Held)
+    yield "held_policy"
+    MODELS.unregister("held_policy")
+
+
+def test_a_registered_module_is_a_policy_on_its_newest_rows(held_model, tmp_path):
+    config = CloneConfig(epochs=1, window=20)
+    policy = fit_policy(demonstrations(), held_model, config=config, progress=False)
+    times, values, masks = episode()
+    chosen = acted(policy, times, values, masks)
+    state = policy.state()
+    expected = policy.act(times[-1] + 1, [0.1, 0.2])
+    policy.restore(state)
+    assert np.array_equal(policy.act(times[-1] + 1, [0.1, 0.2]), expected)
+    assert np.array_equal(policy.act(times[-1] + 2), expected), "held values, no time"
+    assert np.ptp(chosen) > 0
+    with pytest.raises(ob.InputError, match="has no recurrent state"):
+        export_policy(policy, tmp_path / "held.onnx")
+
+
+def test_drops_take_what_they_say_and_never_the_first_frame():
+    times = np.tile(0.05 * np.arange(200), (400, 1))
+    random = np.random.default_rng(0)
+    arrives = Drops(0.8).draw(times, random, channels=3)
+    fractions = arrives.mean(axis=(1, 2))
+    assert arrives[:, 0].all()
+    assert np.array_equal(arrives.any(axis=2), arrives.all(axis=2))
+    assert abs(fractions.mean() - 0.6) < 0.02
+    assert fractions.min() < 0.3
+    assert fractions.max() > 0.95
+    sensors = Drops(0, 0.5).draw(times, random, channels=3, sensors=[[0, 1], [2]])
+    assert np.array_equal(sensors[..., 0], sensors[..., 1])
+    assert (sensors[..., 0] != sensors[..., 2]).any()
+    assert abs(sensors.mean() - 0.75) < 0.02
+    bursts = Drops(0, 0, 0.6, (0.5, 0.5)).draw(times, random, channels=1)[..., 0]
+    assert abs(bursts.mean() - 0.7) < 0.05
+    ends = np.flatnonzero(np.diff(bursts[0].astype(int)) == -1)
+    assert not any(bursts[0, end + 1 : end + 9].any() for end in ends if end < 190)
+    with pytest.raises(ob.InputError, match="frames must be a fraction"):
+        Drops(1.0)
+
+
+def pendulum_expert(observation):
+    """Pumps energy, then balances; see examples/policies/pendulum.py."""
+    cosine, sine, speed = np.moveaxis(np.asarray(observation, dtype=float), -1, 0)
+    lacking = 5.0 - (speed**2 / 6 + 5.0 * cosine)
+    pump = 2.0 * np.where(speed >= 0, 1.0, -1.0) * np.clip(2 * lacking, -1, 1)
+    balance = -15.0 * np.arctan2(sine, cosine) - 3.7 * speed
+    return np.where((cosine > 0.85) & (abs(speed) < 4), balance, pump).clip(-2, 2)[..., None]
+
+
+class Random:
+    """Acts at random."""
+
+    def reset(self, n=None):
+        self.n, self.random = n, np.random.default_rng(0)
+
+    def act(self, t, observation, mask, *, now):
+        return self.random.uniform(-2, 2, (self.n, 1))
+
+
+def test_a_small_cloning_beats_random_and_held_values_under_drops(held_model):
+    pytest.importorskip("gymnasium")
+    names = ("cosine", "sine", "speed")
+    shown = demonstrate(pendulum_expert, "Pendulum-v1", 40, seed=100, noise=0.3, names=names)
+    assert shown.names == (*names, "action_0")
+    assert shown.meta["mean_return"] > -300
+    common = {"bounds": ([-2.0], [2.0]), "progress": False}
+    config = CloneConfig(epochs=100, window=40)
+    policy = fit_policy(shown, "ode_rnn", drops=Drops(frames=0.9), config=config,
+                        field_units=(32, 32), decoder_units=(32,), **common)  # fmt: skip
+    # The rival is trained with the same drops: on complete observations it is weaker.
+    held = fit_policy(shown, held_model, drops=Drops(frames=0.9), config=config, width=64, **common)
+    test = {"episodes": 24, "seed": 7, "drop": 0.7}
+    returns = {
+        name: rollout(one, "Pendulum-v1", **test).returns.mean()
+        for name, one in {"policy": policy, "held": held, "random": Random()}.items()
+    }
+    assert returns["random"] < -900
+    assert returns["policy"] > 0.4 * returns["random"]
+    assert returns["policy"] > returns["held"] + 30
+
+
+def test_a_rollout_is_the_environment_driven_by_hand():
+    gymnasium = pytest.importorskip("gymnasium")
+    env = gymnasium.make("Pendulum-v1")
+    expected = []
+    for i in range(3):
+        observation, _ = env.reset(seed=40 + i)
+        total = 0.0
+        for _ in range(50):
+            observation, reward, *_ = env.step(
+                pendulum_expert(observation.astype(float)).astype(np.float32)
+            )
+            total += float(reward)
+        expected.append(total)
+    found = rollout(HeldController(pendulum_expert), "Pendulum-v1", 3, seed=40, steps=50)
+    assert np.allclose(found.returns, expected)
+    assert found.steps.tolist() == [50, 50, 50]
+    assert found.observed == 1.0
+
+
+def test_what_a_rollout_cannot_do_is_said():
+    pytest.importorskip("gymnasium")
+    held = HeldController(pendulum_expert)
+    with pytest.raises(ob.InputError, match="Gymnasium has no environment 'Pendulun-v1'"):
+        rollout(held, "Pendulun-v1")
+    with pytest.raises(ob.InputError, match="must be a Box of one dimension"):
+        rollout(held, "CartPole-v1")
+    with pytest.raises(ob.InputError, match=r"gave actions of shape \(2,\)"):
+        rollout(HeldController(lambda seen: np.zeros((len(seen), 2))), "Pendulum-v1", 2)
+    with pytest.raises(ob.InputError, match="recorded in time"):
+        demonstrate(pendulum_expert, "Pendulum-v1", 1, delay_s=0.1)
