@@ -17,6 +17,7 @@ from offbeat.kernels import cpu
 from offbeat.kernels.spec import ScanParts, ScanSpec, StepInputs
 from offbeat.models.gains import LOOSE, Filters, tune_filters
 from offbeat.models.zoo import MODELS
+from offbeat.parts import Perceptron
 from offbeat.parts.trend import Trend
 
 BACKENDS = ["reference", *cpu.instruction_sets()]
@@ -109,13 +110,63 @@ def test_an_untrained_model_is_the_filter_of_pykalman() -> None:
         np.testing.assert_allclose(got[first + 1 :, c], expected, rtol=0, atol=1e-7)
 
 
+# --- the unit of the vector field -----------------------------------------------------------------
+
+
+def test_the_error_of_a_filter_is_in_standard_deviations_of_its_channel() -> None:
+    random, rows = np.random.default_rng(0), 200
+    times, made = 0.1 * np.arange(rows), []
+    for _ in range(40):
+        noise = random.normal(size=rows)
+        still = 3.0 * random.normal() + 0.03 * noise  # an offset per trajectory
+        values = np.stack([noise, still, np.cumsum(noise)], axis=1)
+        made.append(Trajectory(times, values))
+    errors = [each[4] for each in tune_filters(Dataset(tuple(made)))]
+    assert errors[0] == pytest.approx(1.0, abs=0.1)  # nothing predicts it better than its mean
+    assert errors[1] == pytest.approx(0.01, rel=0.3)
+    assert errors[1] < errors[2] < errors[0]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_vector_field_gives_its_outputs_in_the_unit_of_the_errors_of_the_filter(
+    backend: str,
+) -> None:
+    model, data = exact(), dataset(4, seed=3, rows=40)
+    channels, field = model.channels, model.field
+    assert isinstance(field, Perceptron)
+    assert field.unit is not None
+    errors = model.filters.error
+    hidden = torch.ones(model.hidden_size, dtype=torch.float64)
+    torch.testing.assert_close(field.unit.double(), torch.cat([errors, errors, hidden]))
+    field.unit = torch.cat([torch.tensor([0.5, 0.25, 2.0] * 2).double()[: 2 * channels], hidden])
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        field.weights[-1].normal_(0.0, 0.3, generator=generator)
+        field.biases[-1].normal_(0.0, 0.3, generator=generator)
+    weight, bias = field.weights[-1].detach().clone(), field.biases[-1].detach().clone()
+    with kernels.use(backend):
+        got = model(model.batch(data)).mean
+        (to_weight,) = torch.autograd.grad(got.square().sum(), [field.weights[-1]])
+        with torch.no_grad():
+            field.weights[-1].mul_(field.unit[:, None])
+            field.biases[-1].mul_(field.unit)
+        unit, field.unit = field.unit, None
+        expected = model(model.batch(data)).mean
+        (to_product,) = torch.autograd.grad(expected.square().sum(), [field.weights[-1]])
+    assert not torch.equal(weight, field.weights[-1])
+    assert not torch.equal(bias, field.biases[-1])
+    torch.testing.assert_close(got, expected, rtol=1e-12, atol=0)
+    torch.testing.assert_close(to_weight, to_product * unit[:, None], rtol=1e-9, atol=1e-12)
+
+
 # --- gains ----------------------------------------------------------------------------------------
 
 
 def filters(seed: int, channels: int) -> Filters:
     random = np.random.default_rng(seed)
     low, high = np.array([[-3, -4, -5, -9], [1, 1, 5, 4]])[..., None]
-    return Filters(torch.from_numpy(10 ** random.uniform(low, high, (4, channels))))
+    table = torch.from_numpy(10 ** random.uniform(low, high, (4, channels)))
+    return Filters(table, torch.ones(channels, dtype=torch.float64))
 
 
 def test_compiled_gains_are_those_of_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:

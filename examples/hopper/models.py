@@ -58,10 +58,10 @@ LONG: dict[str, Any] = {
 
 SHORT: dict[str, Any] = {
     **LONG,
-    "training": {"epochs": 20, "batch_size": 32, "learning_rate": 0.003},
+    "training": {"epochs": 10, "batch_size": 32, "learning_rate": 0.003},
     "linear": True,
 }
-"""The large model for 20 epochs, from which each plan of `ABLATION` differs in one thing."""
+"""The large model for 10 epochs, from which each plan of `ABLATION` differs in one thing."""
 
 _PLAIN = {**SHORT, "linear": False}
 
@@ -75,7 +75,7 @@ PLANS = {
     "large_fresh": Plan("anchored, large, 40 epochs", **LONG, linear=True),
     "large_fresh_on": Plan("anchored, large, 52 epochs", **_after(12)),
     "large_fresh_long": Plan("anchored, large, 150 epochs", **_after(110)),
-    "short": Plan("the large model for 20 epochs", **SHORT),
+    "short": Plan("the large model for 10 epochs", **SHORT),
     "kept_masks": Plan("masks drawn once", **SHORT, kept="masks"),
     "kept_windows": Plan("windows drawn once", **SHORT, kept="windows"),
     "thesis_windows": Plan(
@@ -97,7 +97,7 @@ ABLATION = (
     "small",
     "direct_gru",
 )
-"""The large model, and plans that differ from it in one thing: all of 20 epochs."""
+"""The large model, and plans that differ from it in one thing: all of 10 epochs."""
 
 
 def train(

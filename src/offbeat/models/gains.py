@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from offbeat.baselines.base import moments
+from offbeat.baselines.base import Array, moments
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.kalman import Belief, transition
 from offbeat.baselines.kalman_channels import Wiring, fit_chains
@@ -41,13 +41,16 @@ CELLS = 30_000
 KEPT = 8
 """Data sets whose filters are kept: models of several sizes or seeds are made for the same data."""
 
-_tuned: dict[str, tuple[tuple[float, float, float, float], ...]] = {}
+SMALLEST_ERROR = 1e-3
+"""Least typical error of a filter, in standard deviations of its channel."""
+
+_tuned: dict[str, tuple[tuple[float, ...], ...]] = {}
 
 LOOSE = 1e8
 """Variance of a level before its first observation."""
 
 
-def tune_filters(train: Dataset) -> tuple[tuple[float, float, float, float], ...]:
+def tune_filters(train: Dataset) -> tuple[tuple[float, ...], ...]:
     """Finds the filter of each channel.
 
     Args:
@@ -55,7 +58,7 @@ def tune_filters(train: Dataset) -> tuple[tuple[float, float, float, float], ...
             drawn from it.
 
     Returns:
-        Per channel, as of `Filters`: clock, damping, drive and walk.
+        Per channel, as of `Filters`: clock, damping, drive, walk and error.
     """
     tasks = train
     if not any(masked_values(t).any() for t in train):
@@ -73,20 +76,37 @@ def tune_filters(train: Dataset) -> tuple[tuple[float, float, float, float], ...
     return _tuned[key]
 
 
-def _tune(tasks: Dataset) -> tuple[tuple[float, float, float, float], ...]:
+def _tune(tasks: Dataset) -> tuple[tuple[float, ...], ...]:
     channels = [[c, -1] for c in range(tasks.channels)]
     sample = Sample.of(tasks, np.array(channels), two_sided=False, cells=CELLS)
     mean, scale = moments(tasks)
     weights = sample.weights()
     longest = sample.longest(weights)[:, 0]
     wiring = Wiring.of(tasks, channels, np.ones((len(channels), 2)), mean, scale, longest)
-    found, _ = fit_chains(wiring, sample, scale, weights)
+    found, loss = fit_chains(wiring, sample, scale, weights)
     damping = torch.from_numpy(found.damping)
     clock, far = torch.from_numpy(found.clock), torch.from_numpy(found.longest)
     damping = torch.maximum(damping, clock / (FURTHEST * torch.maximum(far, clock)))
-    each = (clock, damping, torch.from_numpy(found.drive), torch.from_numpy(found.walk))
+    error = torch.from_numpy(_errors(sample, weights, loss) / scale)
+    error = error.nan_to_num(nan=1.0).clamp(SMALLEST_ERROR, 1.0)
+    each = (clock, damping, torch.from_numpy(found.drive), torch.from_numpy(found.walk), error)
     columns = [column.tolist() for column in each]
     return tuple(zip(*columns, strict=True))
+
+
+def _errors(sample: Sample, weights: Array, loss: Array) -> Array:
+    """(channels,) typical errors of filters at the longest time that counts.
+
+    Args:
+        sample: that they were tuned on, a column per channel and state.
+        weights: (bins, columns) of its bins.
+        loss: (channels, states) mean over bins of log(MSE / MSE of the reference).
+    """
+    shape = (len(weights), *loss.shape)
+    counts, reference = (of.reshape(shape)[..., 0] for of in (weights > 0.5, sample.reference))
+    last = np.max(counts * np.arange(len(counts))[:, None], axis=0)
+    mse = reference[last, np.arange(len(last))] * np.exp(loss[:, 0])
+    return np.asarray(np.sqrt(mse))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,18 +116,22 @@ class Filters:
     Attributes:
         table: (4, channels) float64: the clock of each channel, s; and per clock its damping, the
             variance of the noise on its slope, and that on its level.
+        error: (channels,) float64, typical error at the longest time tuned for, in standard
+            deviations of the channel, at most 1.
     """
 
     table: Tensor
+    error: Tensor
 
     @classmethod
-    def of(cls, filters: tuple[tuple[float, float, float, float], ...]) -> Filters:
+    def of(cls, filters: tuple[tuple[float, ...], ...]) -> Filters:
         """From `Statistics.filters`."""
-        return cls(torch.tensor(filters, dtype=torch.float64).reshape(-1, 4).t().contiguous())
+        table = torch.tensor(filters, dtype=torch.float64).reshape(-1, 5).t().contiguous()
+        return cls(table[:4].contiguous(), table[4].clone())
 
     def to(self, device: torch.device) -> Filters:
         """The same on a device."""
-        return Filters(self.table.to(device))
+        return Filters(self.table.to(device), self.error.to(device))
 
     def damping(self, unit: float) -> Tensor:
         """(channels,) damping of the slopes per `unit` s."""

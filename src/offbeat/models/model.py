@@ -112,6 +112,10 @@ class Model(BaseModel):
             field = FIELDS[self.spec.field_kind]
             sizes = (self.spec.field[0], *(config.field_units or ()), self.spec.field[-1])
             self.field = field(sizes=sizes, activation=self.spec.activation)
+        if self.trend is not None and isinstance(self.field, Perceptron):
+            # Optimizers take steps of one size, whatever a channel's errors are.
+            error = self.filters.error.to(self.mean.dtype)
+            self.field.unit = torch.cat([error, error, torch.ones(hidden)])
         self.start = nn.Parameter(torch.zeros(channels)) if anchored else None
         shape = HeadShape(
             channels=channels,

@@ -40,7 +40,7 @@ class Statistics:
     rows: int = 0
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
-    filters: tuple[tuple[float, float, float, float], ...] = ()
+    filters: tuple[tuple[float, ...], ...] = ()
 
     @property
     def channels(self) -> int:

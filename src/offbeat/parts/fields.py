@@ -19,19 +19,29 @@ class Perceptron(nn.Module):
     Args:
         sizes: units of input, hidden layers and output.
         activation: `tanh` or `silu`.
+
+    Attributes:
+        unit: (outputs,) that the outputs are in units of, or None. It is no weight and not saved.
     """
+
+    unit: Tensor | None
 
     def __init__(self, sizes: tuple[int, ...], activation: str) -> None:
         super().__init__()
         self.activation = activation
+        self.register_buffer("unit", None, persistent=False)
         pairs = list(pairwise(sizes))
         self.weights = nn.ParameterList(torch.empty(out, into) for into, out in pairs)
         self.biases = nn.ParameterList(torch.zeros(out) for _, out in pairs)
 
     @property
     def layers(self) -> Layers:
-        """Weight and bias of each layer."""
-        return tuple(zip(self.weights, self.biases, strict=True))
+        """Weight and bias of each layer, those of the last one times the unit."""
+        layers = tuple(zip(self.weights, self.biases, strict=True))
+        if self.unit is None:
+            return layers
+        weight, bias = layers[-1]
+        return (*layers[:-1], (weight * self.unit[:, None], bias * self.unit))
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
