@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -340,12 +341,15 @@ class Model(BaseModel):
 
     def scan_parts(self) -> ScanParts:
         """The trained parts of the scan."""
+        field: Any = self.field
+        if isinstance(field, Perceptron):
+            field = field.of_scan()
         return ScanParts(
             cell=self.cell,
             decay=self.decay.weights() if self.decay is not None else None,
             input_decay=self.input_decay.weights() if self.input_decay is not None else None,
             trend=self.trend.weights() if self.trend is not None else None,
-            field=self.field,
+            field=field,
             decoder=self.head.layers if self.spec.decoder else (),
         )
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -46,6 +47,32 @@ class Perceptron(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(..., inputs) to (..., outputs)."""
         return perceptron(self.layers, x, self.activation)
+
+    def of_scan(self) -> Perceptron | LayeredField:
+        """The same for one scan: itself, or, with a unit, layers that are computed once."""
+        return self if self.unit is None else LayeredField(self.layers, self.activation)
+
+
+@dataclass(frozen=True, eq=False)
+class LayeredField:
+    """A perceptron of given tensors.
+
+    Attributes:
+        layers: weight and bias of each.
+        activation: as of `Perceptron`.
+    """
+
+    layers: Layers
+    activation: str
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """(..., inputs) to (..., outputs)."""
+        return perceptron(self.layers, x, self.activation)
+
+    def parameters(self) -> Iterator[Tensor]:
+        """All tensors, layer by layer."""
+        for layer in self.layers:
+            yield from layer
 
 
 FIELDS: Registry[Callable[..., nn.Module]] = Registry("vector field", group="offbeat.fields")
