@@ -32,6 +32,7 @@ STAGES = (
     "calibration",
     "metrics",
     "examples",
+    "sharded",
     "run",
     "captured",
     "training",

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from offbeat.config import Recipe
+from offbeat.data.shards import ShardedDataset
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
 from offbeat.files import clean, write_text
@@ -267,7 +268,7 @@ def locked(folder: Path) -> Iterator[None]:
 def identity_of(
     model: BaseModel,
     recipe: Recipe,
-    train: Dataset,
+    train: Dataset | ShardedDataset,
     validation: Dataset | None,
     baselines: Sequence[Any] | None = None,
 ) -> dict[str, Any]:
@@ -315,10 +316,21 @@ def _predictor(predictor: Any) -> dict[str, Any]:
     return {"kind": type(predictor).__name__, "arrays": digest.hexdigest()}
 
 
-def _part(dataset: Dataset) -> dict[str, Any]:
+def _part(dataset: Dataset | ShardedDataset) -> dict[str, Any]:
     """The identity of a data set, from its channels to its fingerprint."""
+    channels = [f"{n} [{u}]" for n, u in zip(dataset.names, dataset.units, strict=True)]
+    if isinstance(dataset, ShardedDataset):
+        return {
+            "channels": channels,
+            "trajectories": len(dataset),
+            "rows": dataset.rows,
+            "files": len(dataset.shards),
+            "window": dataset.window,
+            "cache_mb": dataset.cache_mb,
+            "fingerprint": dataset.fingerprint(),
+        }
     return {
-        "channels": [f"{n} [{u}]" for n, u in zip(dataset.names, dataset.units, strict=True)],
+        "channels": channels,
         "trajectories": len(dataset),
         "rows": sum(t.rows for t in dataset),
         "observed": sum(int(t.observed.sum()) for t in dataset),

@@ -19,11 +19,13 @@ from torch import Tensor
 from offbeat.baselines import Baseline
 from offbeat.captured import CapturedStep, autocast, captured, check_precision, products
 from offbeat.config import Recipe, TrainConfig
+from offbeat.data.shards import ShardedDataset
 from offbeat.data.trajectory import Dataset
 from offbeat.devices import resolved
 from offbeat.distributed import Ranks, current, device_here, is_first, on_first
 from offbeat.errors import DivergenceError, InputError
 from offbeat.examples import (
+    REFERENCE_TASKS,
     Examples,
     RedrawnExamples,
     Reference,
@@ -53,8 +55,11 @@ from offbeat.run import (
     unpack,
     write_log,
 )
+from offbeat.sharded import ShardedEpoch, ShardedTrainingSet, check_trainable
 
 __all__ = ["Callback", "Examples", "FitResult", "ValidationSet", "fit", "train_step", "validate"]
+
+AnyExamples = Examples | RedrawnExamples | ShardedEpoch
 
 READ_EVERY = 10
 """Steps after which losses of another device than the CPU are read, and the progress is shown."""
@@ -98,7 +103,7 @@ class FitResult:
 
 def fit(
     model: BaseModel,
-    train: Dataset,
+    train: Dataset | ShardedDataset,
     validation: Dataset | None = None,
     config: TrainConfig | None = None,
     *,
@@ -126,7 +131,8 @@ def fit(
     Args:
         model: trained in place.
         train: the training set; masked values that are known serve as targets. With tasks or
-            redraw, whole trajectories.
+            redraw, whole trajectories. A folder of `Dataset.open` is read group by group; the
+            baselines of a relative loss are fitted to a sample of it.
         validation: scored after each epoch; with tasks, on tasks that are drawn from it once.
         config: fields that are None, or all of them if it is None, follow the model's recipe.
         out: folder for `log.csv`, checkpoints and the final `model`; a run that was stopped there
@@ -149,7 +155,11 @@ def fit(
         DivergenceError: the loss is no longer finite and no best weights are kept; the last good
             checkpoint is.
     """
-    train = Dataset.of(train)
+    sharded: ShardedDataset | None = None
+    if isinstance(train, ShardedDataset):
+        sharded, whole = train, train.sample(REFERENCE_TASKS)
+    else:
+        train = whole = Dataset.of(train)
     validation = None if validation is None else Dataset.of(validation)
     asked = config or TrainConfig()
     if validation is None and (asked.patience is not None or asked.keep == "best"):
@@ -162,10 +172,12 @@ def fit(
         model.to(resolved(there, model, batch=size))
     if asked.tasks is not None:
         model.expect_silences(asked.tasks.horizon_s)
-    trained_on = ordered(model, train)
+    trained_on = ordered(model, whole)
     if asked.redraw is not None:
         model.expect_silences(longest_silence(trained_on, asked.redraw, seed=asked.seed))
     recipe = recipe_of(model.name, asked, validated=validation is not None)
+    if sharded is not None:
+        check_trainable(sharded, recipe)
     reference = None
     if recipe.relative:
         fitted_to, measured_on = reference_tasks(trained_on, recipe)
@@ -188,16 +200,13 @@ def fit(
     with ExitStack() as stack:
         if folder is not None or current() is not None:
             on_first(lambda: _lock(stack, folder))
-        examples = stack.enter_context(
-            closing(
-                TrainingSet(
-                    model,
-                    trained_on,
-                    recipe,
-                    reference=reference if recipe.loss == "relative" else None,
-                )
-            )
-        )
+        units = reference if recipe.loss == "relative" else None
+        examples: TrainingSet | ShardedTrainingSet
+        if sharded is None:
+            examples = TrainingSet(model, trained_on, recipe, reference=units)
+        else:
+            examples = ShardedTrainingSet(model, sharded, recipe, reference=units)
+        stack.enter_context(closing(examples))
         parameters = stack.enter_context(flat_parameters(model))
         stack.enter_context(model.threads())
         state = RunState(parameters, recipe)
@@ -228,7 +237,7 @@ def _lock(stack: ExitStack, folder: Path | None) -> None:
 
 def _fit(
     model: BaseModel,
-    training_set: TrainingSet,
+    training_set: TrainingSet | ShardedTrainingSet,
     validated: ValidationSet | None,
     recipe: Recipe,
     state: RunState,
@@ -307,14 +316,17 @@ def _recover(model: BaseModel, state: RunState, recipe: Recipe, error: Divergenc
 
 def _epoch(
     model: BaseModel,
-    examples: Examples | RedrawnExamples,
+    examples: AnyExamples,
     state: RunState,
     recipe: Recipe,
     bar: Any,
     folder: Path | None,
     identity: dict[str, Any],
 ) -> None:
-    order = order_of(recipe.seed, state.epoch, len(examples))
+    if isinstance(examples, ShardedEpoch):  # it has an order of its own
+        order = np.arange(len(examples))
+    else:
+        order = order_of(recipe.seed, state.epoch, len(examples))
     steps = math.ceil(len(examples) / recipe.batch_size)
     losses = _Losses(state)
     elsewhere = _Elsewhere(model, examples, state, recipe, order, steps)
@@ -345,7 +357,7 @@ def _epoch(
 
 def train_step(
     model: BaseModel,
-    examples: Examples | RedrawnExamples,
+    examples: AnyExamples,
     index: Tensor,
     state: RunState,
     recipe: Recipe,
@@ -422,7 +434,7 @@ def _clip(state: RunState, recipe: Recipe) -> None:
 def _descend_together(
     ranks: Ranks,
     model: BaseModel,
-    examples: Examples | RedrawnExamples,
+    examples: AnyExamples,
     index: Tensor,
     state: RunState,
     recipe: Recipe,
@@ -487,7 +499,7 @@ class _Elsewhere:
     def __init__(
         self,
         model: BaseModel,
-        examples: Examples | RedrawnExamples,
+        examples: AnyExamples,
         state: RunState,
         recipe: Recipe,
         order: NDArray[np.int64],

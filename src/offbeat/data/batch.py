@@ -93,6 +93,29 @@ class Batch:
             roles or tuple(getattr(trajectories[0], "roles", ())),
         )
 
+    @classmethod
+    def joined(cls, batches: Sequence[Batch]) -> Batch:
+        """One batch of several of the same channels, padded to the longest trajectory.
+
+        Args:
+            batches: at least one.
+        """
+        rows = max(batch.rows for batch in batches)
+
+        def padded(name: str) -> Tensor:
+            each = []
+            for batch in batches:
+                tensor: Tensor = getattr(batch, name)
+                missing = rows - batch.rows
+                if missing:
+                    last = tensor[:, -1:] if name == "times" else torch.zeros_like(tensor[:, -1:])
+                    tensor = torch.cat([tensor, last.expand(-1, missing, *last.shape[2:])], dim=1)
+                each.append(tensor)
+            return torch.cat(each)
+
+        tensors: dict[str, Any] = {name: padded(name) for name, _ in batches[0]._tensors()}
+        return replace(batches[0], **tensors)
+
     def __len__(self) -> int:
         return self.times.shape[0]
 

@@ -71,13 +71,6 @@ class Scaler:
         one_of("scaler", kind, SCALERS)
         count, mean, square, low, high = moments(dataset)
         check_observed(dataset.names, count, len(dataset), roles=dataset.roles)
-        if kind == "identity":
-            return cls.identity(dataset.channels)
-        low, high = np.where(count, low, 0.0), np.where(count, high, 1.0)  # without a value
-        if kind == "standardise":
-            deviation = np.sqrt(square)
-            # The scale of a constant channel stays 1.
-            return cls(kind, mean, np.where(deviation > 1e-12 * np.abs(mean), deviation, 1.0))
         if kind == "robust":
             columns = [
                 np.concatenate([t.values[t.observed[:, c], c] for t in dataset])
@@ -88,10 +81,50 @@ class Scaler:
             deviation = np.array([clipped(column).std() for column in columns])
             centre = np.array([np.median(column) for column in columns])
             return cls(kind, centre, np.where(deviation > 1e-12 * np.abs(centre), deviation, 1.0))
+        return cls.of_moments(kind, dataset.names, count, mean, square, low, high)
+
+    @classmethod
+    def of_moments(
+        cls,
+        kind: str,
+        names: Sequence[str],
+        count: NDArray[np.int64],
+        mean: NDArray[np.float64],
+        variance: NDArray[np.float64],
+        low: NDArray[np.float64],
+        high: NDArray[np.float64],
+    ) -> Scaler:
+        """A scaler of any kind but `robust`, from what `moments` measures.
+
+        Args:
+            kind: of the scaler.
+            names: of the channels, for messages.
+            count: (channels,) observed values.
+            mean: (channels,) of them.
+            variance: (channels,) of them.
+            low: (channels,) smallest of them.
+            high: (channels,) largest of them.
+
+        Raises:
+            InputError: it is `robust`, which needs all values; or a maximum is 0 under
+                `divide_by_max`.
+        """
+        if kind == "identity":
+            return cls.identity(len(names))
+        if kind == "robust":
+            raise InputError(
+                "the scaler 'robust' needs all values in memory; give 'standardise', or a scaler "
+                "that was fitted to a sample"
+            )
+        low, high = np.where(count, low, 0.0), np.where(count, high, 1.0)  # without a value
+        if kind == "standardise":
+            deviation = np.sqrt(variance)
+            # The scale of a constant channel stays 1.
+            return cls(kind, mean, np.where(deviation > 1e-12 * np.abs(mean), deviation, 1.0))
         if kind == "min_max":
             return cls(kind, low, np.where(high > low, high - low, 1.0))
         if (high == 0).any():
-            name = dataset.names[int((high == 0).argmax())]
+            name = names[int((high == 0).argmax())]
             raise InputError(
                 f"divide_by_max: the maximum of channel {name!r} is 0; use 'min_max' instead"
             )

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
@@ -313,10 +314,40 @@ class Dataset(Sequence[Trajectory]):
             return cls((data,))
         if isinstance(data, list | tuple) and all(isinstance(one, Trajectory) for one in data):
             return cls(tuple(data))
+        if hasattr(data, "parts"):  # a folder
+            raise InputError(
+                "a folder of Parquet files is taken by make_model and fit alone; other functions "
+                "take its parts: for part in data.parts()"
+            )
         raise InputError(
             f"expected a Dataset, a Trajectory or a list of them, got {type(data).__name__}; "
             "offbeat.read gives a data set of a file"
         )
+
+    @staticmethod
+    def open(folder: str | Path, *, window: int | None = None, cache_mb: float = 256.0) -> Any:
+        """Opens a folder of Parquet files without reading their values.
+
+        `make_model` and `fit` take the result in place of a training set: scales and statistics are
+        measured in one pass, and windows are read group by group, at most `cache_mb` of them at a
+        time. `parts` gives the data set of each file, and `sample` some windows in memory.
+
+        Args:
+            folder: with files that `save` or `offbeat.data.shards.save_shards` wrote, of the same
+                channels.
+            window: rows of a window; None for whole trajectories.
+            cache_mb: MB of windows in memory at a time, about.
+
+        Returns:
+            A `ShardedDataset`.
+
+        Raises:
+            FileFormatError: there is no such file, one is damaged, or channels differ.
+            InputError: an option is out of range.
+        """
+        from offbeat.data.shards import ShardedDataset
+
+        return ShardedDataset.open(folder, window=window, cache_mb=cache_mb)
 
     @property
     def names(self) -> tuple[str, ...]:

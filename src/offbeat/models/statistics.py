@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from offbeat.data.batch import Batch, last_index
-from offbeat.data.scaler import clipped
+from offbeat.data.scaler import Scaler, clipped
+from offbeat.data.shards import Moments
 from offbeat.data.trajectory import EXOGENOUS
 from offbeat.errors import InputError
 
@@ -97,6 +98,35 @@ class Statistics:
             batch.rows,
             tuple(torch.where(never, 0.0, low).tolist()),
             tuple(torch.where(never, 0.0, high).tolist()),
+        )
+
+    @classmethod
+    def of_moments(cls, moments: Moments, scaler: Scaler, *, rows: int) -> Statistics:
+        """From one pass over a folder.
+
+        Args:
+            moments: in the channels' units.
+            scaler: that the model works with.
+            rows: of the longest window.
+        """
+        none = moments.count == 0
+        mean = np.where(none, 0.0, scaler.scaled(moments.mean))
+        std = np.sqrt(moments.variance) / np.abs(scaler.scale)
+        std = np.where(std > 1e-7 * np.maximum(np.abs(mean), 1e-30), std, 1.0)
+        ends = [
+            np.where(none, 0.0, scaler.scaled(np.where(none, 0.0, end)))
+            for end in (moments.low, moments.high)
+        ]
+        low, high = np.minimum(*ends), np.maximum(*ends)  # a scale may be negative
+        return cls(
+            tuple(mean.tolist()),
+            tuple(std.tolist()),
+            moments.median_gap,
+            moments.longest_elapsed,
+            moments.longest_delta,
+            rows,
+            tuple(low.tolist()),
+            tuple(high.tolist()),
         )
 
     def to_dict(self) -> dict[str, Any]:

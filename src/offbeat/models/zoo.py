@@ -16,7 +16,8 @@ from torch import nn
 
 from offbeat.config import ModelConfig, Recipe, TrainConfig, check_seed, from_mapping
 from offbeat.data.batch import Batch
-from offbeat.data.scaler import Scaler, ScalerKind, check_observed
+from offbeat.data.scaler import SCALERS, Scaler, ScalerKind, check_observed
+from offbeat.data.shards import ShardedDataset
 from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
 from offbeat.errors import InputError, one_of
@@ -291,7 +292,7 @@ def recipe_of(name: str, config: TrainConfig | None = None, *, validated: bool) 
 
 def make_model(
     model: str | ModelConfig,
-    train: Dataset,
+    train: Dataset | ShardedDataset,
     *,
     scaler: ScalerKind | Scaler = "standardise",
     seed: int = 0,
@@ -302,7 +303,8 @@ def make_model(
 
     Args:
         model: name of a model, or a config.
-        train: the training set; means, scales and gaps are measured on its observed values.
+        train: the training set; means, scales and gaps are measured on its observed values. A
+            folder of `Dataset.open` is read once for them.
         scaler: a kind, fitted on `train`, or a scaler fitted elsewhere.
         seed: of the initial weights.
         tasks: that the filters of a model with a trend are tuned on; by default the training set,
@@ -319,16 +321,21 @@ def make_model(
     Example:
         >>> model = make_model("ode_rnn", train, hidden_size=32)  # doctest: +SKIP
     """
+    sharded: ShardedDataset | None = None
+    if isinstance(train, ShardedDataset):
+        sharded, train = train, train.sample()
     train = Dataset.of(train)
     check_seed(seed)
     name = model if isinstance(model, str) else model.name
     entry = MODELS[name]
     if entry.factory is not None:
-        return _foreign(name, entry.factory, _info(train, scaler), options, seed)
+        info = _info(train, scaler) if sharded is None else _info_of(sharded, train, scaler)
+        return _foreign(name, entry.factory, info, options, seed)
     config = ModelConfig(name=model) if isinstance(model, str) else model
     for key in options:
         one_of("model option", key, [f.name for f in fields(config)])
-    config, info = resolve(replace(config, **options)), _info(train, scaler)
+    config = resolve(replace(config, **options))
+    info = _info(train, scaler) if sharded is None else _info_of(sharded, train, scaler)
     if config.trend:
         filters = tune_filters(train if tasks is None else tasks)
         info = replace(info, statistics=replace(info.statistics, filters=filters))
@@ -356,6 +363,30 @@ def _info(train: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
         scaler,
         Statistics.of(batch, robust=scaler.kind == "robust"),
         Transforms.of(train),
+    )
+
+
+def _info_of(sharded: ShardedDataset, sample: Dataset, scaler: ScalerKind | Scaler) -> DataInfo:
+    """`_info` of a folder, from one pass over it."""
+    if all(role == EXOGENOUS for role in sharded.roles):
+        raise InputError(
+            "every channel is exogenous, so there is nothing to predict; give one the role 'state'"
+        )
+    found = sharded.moments
+    check_observed(sharded.names, found.count, len(sharded), roles=sharded.roles)
+    if isinstance(scaler, str):
+        one_of("scaler", scaler, SCALERS)
+        each = (found.count, found.mean, found.variance, found.low, found.high)
+        scaler = Scaler.of_moments(scaler, sharded.names, *each)
+    rows = max(max(shard.rows) for shard in sharded.shards)
+    rows = rows if sharded.window is None else min(rows, sharded.window)
+    return DataInfo(
+        sharded.names,
+        sharded.units,
+        sharded.roles,
+        scaler,
+        Statistics.of_moments(found, scaler, rows=rows),
+        Transforms.of(sample),
     )
 
 
