@@ -130,7 +130,8 @@ def test_outliers_and_long_times_give_bounded_predictions():
     asked = ob.Dataset((ob.Trajectory(times, values),))
     predicted = fitted.predict(asked)[0]
     assert fitted.bound[0, 0] <= predicted.min()
-    assert predicted.max() <= fitted.bound[1, 0]
+    # As far out as the last value, up to ten scales.
+    assert predicted.max() <= fitted.bound[1, 0] + 10 * fitted.scale[0]
     # Beyond the longest age of training, the prediction stays.
     assert predicted[-1, 0] == predicted[-2, 0]
 
@@ -449,3 +450,29 @@ def test_outside_all_observations_a_fill_is_a_forecast_in_that_direction():
         fitted.predict(mirrored), fitted.backward.predict(backwards(mirrored)), strict=True
     ):
         assert np.array_equal(p[:20], before[::-1][:20])
+
+
+@pytest.mark.parametrize("name", ["ridge", "ridge_fill"])
+def test_beyond_the_data_of_training_a_change_is_no_larger_than_there(name):
+    """A pose and a motion of another channel that training never had."""
+    random = np.random.default_rng(3)
+
+    def made(count: int, offset: float, jump: float) -> ob.Dataset:
+        logs = []
+        for _ in range(count):
+            times = GAP * np.arange(80)
+            swing = np.sin(3 * times + random.uniform(0, 6))
+            values = np.stack([offset + 0.1 * swing, jump * swing], axis=1)
+            observed = np.ones((80, 2), dtype=bool)
+            observed[40:52, 0] = False
+            values = values + random.normal(0, 1e-3, values.shape)
+            logs.append(ob.Trajectory(times, values, observed=observed))
+        return ob.Dataset(tuple(logs))
+
+    fitted = fit_baseline(name, made(40, 0.0, 1.0))
+    asked = made(10, 0.5, 1000.0)
+    for t, predicted in zip(asked, fitted.predict(asked), strict=True):
+        line = np.interp(t.times, t.times[[39, 52]], t.values[[39, 52], 0])
+        start = line if name == "ridge_fill" else np.full(80, t.values[39, 0])
+        # The position moves by 0.2 from end to end in training.
+        assert np.abs(predicted[40:52, 0] - start[40:52]).max() <= 0.21

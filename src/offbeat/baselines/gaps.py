@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.baselines.base import Array, Rows
-from offbeat.data.trajectory import Dataset
 
 OWN, EACH = 13, 10
 """Features of the channel itself, and of each other one."""
@@ -193,15 +192,3 @@ class Gaps:
         columns[:, 8] = used * u * (1 - u) ** 2 * ends[0]
         columns[:, 9] = used * u**2 * (1 - u) * ends[1]
         return columns.reshape(len(task), EACH * len(near))
-
-
-def longest_gap(dataset: Dataset) -> float:
-    """Longest time between observations of a channel on both sides of a hidden value, in s."""
-    longest = 0.0
-    for t in dataset:
-        for seen in t.observed.T:
-            at = np.flatnonzero(seen)
-            inside = np.diff(at) > 1
-            if inside.any():
-                longest = max(longest, float(np.diff(t.times[at])[inside].max()))
-    return longest

@@ -12,6 +12,9 @@ from offbeat.baselines.base import Array
 PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Penalties that are tried, per example, for features in units of their spread."""
 
+SMALL = 64
+"""Features up to which all penalties are tried in one call, which takes longer for more."""
+
 
 @dataclass(frozen=True, eq=False)
 class Products:
@@ -64,6 +67,31 @@ class Products:
         weights = np.zeros_like(cross)
         if len(self.count) < 2:
             return np.asarray(weights)
+        if len(gram) <= SMALL:
+            errors = self._errors(np.asarray(penalties))
+        else:
+            errors = self._errors_of_large(penalties)
+        best = errors.argmin(axis=0)
+        for i, penalty in enumerate(penalties):
+            if (best == i).any():
+                weights[:, best == i] = _solved(gram, cross[:, best == i], penalty * count)
+        return np.asarray(weights)
+
+    def _errors(self, penalties: Array) -> Array:
+        """(penalties + 1, targets) squared errors of held-out groups, by one call of LAPACK."""
+        gram, cross = self.gram.sum(axis=0) - self.gram, self.cross.sum(axis=0) - self.cross
+        damping = (self.count.sum() - self.count)[:, None] * penalties
+        # Differences of Gram matrices are positive up to rounding errors of their largest entry.
+        damping = np.maximum(damping, 1e-13 * np.einsum("gii->g", gram)[:, None] + 1e-300)
+        damped = np.repeat(gram[:, None], len(penalties), axis=1)
+        damped.reshape(*damped.shape[:2], -1)[..., :: len(gram[0]) + 1] += damping[..., None]
+        w = np.linalg.solve(damped, np.repeat(cross[:, None], len(penalties), axis=1))
+        change = (w * (self.gram[:, None] @ w - 2 * self.cross[:, None])).sum(axis=(0, 2))
+        return np.asarray(np.append(change, np.zeros((1, cross.shape[2])), 0) + self.square.sum(0))
+
+    def _errors_of_large(self, penalties: tuple[float, ...]) -> Array:
+        """The same, one after the other."""
+        gram, cross, count = self.gram.sum(axis=0), self.cross.sum(axis=0), self.count.sum()
         errors = np.zeros((len(penalties) + 1, cross.shape[1]))
         for own_gram, own_cross, square, own in zip(
             self.gram, self.cross, self.square, self.count, strict=True
@@ -72,11 +100,7 @@ class Products:
             for i, penalty in enumerate(penalties):
                 w = _solved(gram - own_gram, cross - own_cross, penalty * (count - own))
                 errors[i] += square + (w * (own_gram @ w - 2 * own_cross)).sum(axis=0)
-        best = errors.argmin(axis=0)
-        for i, penalty in enumerate(penalties):
-            if (best == i).any():
-                weights[:, best == i] = _solved(gram, cross[:, best == i], penalty * count)
-        return np.asarray(weights)
+        return errors
 
     def left(self, weights: Array) -> Products:
         """The products with what weights leave of the targets.

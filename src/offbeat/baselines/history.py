@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from offbeat.baselines.base import Array, State, namespace
-from offbeat.data.trajectory import Dataset
+from offbeat.data.trajectory import Dataset, Trajectory
 
 LONGEST_BIN = 24
 """Most bins of times since observation."""
@@ -137,11 +138,26 @@ class AgeBins:
 
 def typical_gap(dataset: Dataset) -> float:
     """Median time between consecutive observations of a channel, over all channels, in s."""
-    gaps = [np.diff(t.times[t.observed[:, c]]) for t in dataset for c in range(t.channels)]
-    every = np.concatenate(gaps)
+    every = np.concatenate([_steps(t)[2] for t in dataset])
     if not len(every):
         every = np.concatenate([np.diff(t.times) for t in dataset])
     return float(np.median(every)) if len(every) else 1.0
+
+
+def longest_gap(dataset: Dataset) -> float:
+    """Longest time between observations of a channel on both sides of a hidden value, in s."""
+    longest = 0.0
+    for t in dataset:
+        _, rows, steps = _steps(t)
+        longest = max(longest, float(steps[rows > 1].max(initial=0.0)))
+    return longest
+
+
+def _steps(t: Trajectory) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Channel, rows and s between each two observations of a channel that follow one another."""
+    channel, row = np.nonzero(t.observed.T)
+    same = channel[1:] == channel[:-1]
+    return channel[1:][same], np.diff(row)[same], np.diff(t.times[row])[same]
 
 
 def usual_gaps(dataset: Dataset) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +42,9 @@ LIMITS = (4.0, 8.0, 16.0, 32.0)
 
 FREE = 0.01
 """Logarithm of the mean squared error that a limit of innovations may cost."""
+
+_SAMPLES: WeakKeyDictionary[Dataset, dict[bool, Sample]] = WeakKeyDictionary()
+"""Samples of single channels, by tasks and whether predictions are causal: baselines share them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +151,10 @@ def fit_chains(
     spread = np.where(measured, scale[np.maximum(wiring.channels, 0)], 1.0).reshape(-1)
 
     def column_losses(tried: Array) -> Array:
-        found = sample.loss(sample.errors(local.chains(tried)), weights, spread)
+        name = tried.tobytes()
+        if name not in sample.tried:
+            sample.tried[name] = sample.errors(local.chains(tried))
+        found = sample.loss(sample.tried[name], weights, spread)
         return found.reshape(len(found), *measured.shape)
 
     def loss(tried: Array) -> Array:
@@ -349,7 +356,11 @@ def singles(baseline: ChainBaseline, tasks: Dataset, which: str) -> tuple[Chains
     """
     channels = [[c, -1] for c in range(tasks.channels)]
     factors = np.ones((tasks.channels, 2))
-    sample = Sample.of(tasks, np.array(channels), two_sided=not baseline.causal)
+    samples = _SAMPLES.setdefault(tasks, {})
+    if baseline.causal not in samples:
+        two_sided = not baseline.causal
+        samples[baseline.causal] = Sample.of(tasks, np.array(channels), two_sided=two_sided)
+    sample = samples[baseline.causal]
     weights = sample.weights() if which == "all" else sample.halves()[which == "long"]
     wiring = Wiring.of(
         tasks, channels, factors, baseline.mean, baseline.scale, sample.longest(weights)[:, 0]

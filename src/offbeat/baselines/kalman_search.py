@@ -134,6 +134,8 @@ class Sample:
         two_sided: whether masked values are scored, given all others; else all values are that
             follow an observation of their channel, given what was observed before.
         memory: that all calls of `errors` use.
+        tried: errors of parameters that were tried, by their bytes: searches with other weights
+            begin with the same ones.
     """
 
     rows: Rows
@@ -145,6 +147,7 @@ class Sample:
     reference: Array
     two_sided: bool
     memory: Memory = field(default_factory=Memory)
+    tried: dict[bytes, Array] = field(default_factory=dict)
 
     @classmethod
     def of(

@@ -50,8 +50,9 @@ class Ridge(CausalBaseline):
     The features of a channel are its last value, its slopes over 1, 2 and 4 intervals, and its last
     value less exponential averages over 4 typical gaps and over the longest age. :math:`\psi` is
     those of the channel, with and without the factor :math:`r`, and the motion of other channels
-    since it was observed. All are limited to what training had, with a margin, and so are
-    predictions.
+    since it was observed. All are limited to what training had, with a margin. A change is no
+    larger than those of training at that time since observation, and predictions stay in the range
+    of training, with a margin, or as far out as the last value, up to 10 scales.
 
     Weights are those of least squares with relative errors, :math:`1 / r`, on every state of the
     tasks and some later rows. They come in steps, each fitted to what the one before left: own
@@ -64,6 +65,7 @@ class Ridge(CausalBaseline):
 
     most_states: ClassVar[int] = 50_000  # of the tasks, that a fit uses
     most_examples: ClassVar[int] = 6_000  # of a channel in a bin
+    most_inputs: ClassVar[int] = 32  # channels whose features a channel uses
 
     edges: Array  # (bins,) s, of AgeBins
     averages: Array  # (averages,) s, time constants
@@ -72,6 +74,7 @@ class Ridge(CausalBaseline):
     spread: Array  # (channels * features,)
     weight: Array  # (2 * bins + 1, shared features, channels)
     own_weight: Array  # (2 * bins + 1, channels, own features)
+    reach: Array = np.full((1, 1), FURTHEST)  # (2 * bins + 1, channels) farthest change of training
     bound: Array  # (2, channels) lowest and highest prediction
 
     history = History(max(SPANS) + 1)
@@ -79,7 +82,7 @@ class Ridge(CausalBaseline):
     def arrays(self) -> dict[str, Array]:
         """See `Baseline`."""
         names = ("edges", "averages", "followed", "limits", "spread")
-        fitted = ("weight", "own_weight", "bound")
+        fitted = ("weight", "own_weight", "reach", "bound")
         return {**super().arrays(), **{name: getattr(self, name) for name in (*names, *fitted)}}
 
     # --- state --------------------------------------------------------------------------------
@@ -151,9 +154,16 @@ class Ridge(CausalBaseline):
         each = (self.shared(features) @ weight).reshape(-1, bins, channels)
         for i in range(bins):
             change = change + xp.where(at == i, relative * each[:, i], 0.0)
+        # Beyond what was fitted to, a change is no larger than those that were seen.
+        reach = as_kind(np.broadcast_to(self.reach, (bins, channels)).copy(), like)[at, channel]
+        change = xp.minimum(xp.maximum(change, -reach), reach)
         last = History.last(state, as_kind(self.mean, like))
         predicted = last + change * as_kind(self.scale, like)
-        return xp.clip(predicted, as_kind(self.bound[0], like), as_kind(self.bound[1], like))
+        # The last value may be beyond what was fitted to, though not by any amount.
+        low, high = (as_kind(bound, like) for bound in self.bound)
+        further = FURTHEST * as_kind(self.scale, like)
+        low, high = xp.clip(last, low - further, low), xp.clip(last, high, high + further)
+        return xp.minimum(xp.maximum(predicted, low), high)
 
     def shared(self, features: Any) -> Any:
         """(batch, shared features) those of all channels, and a 1."""
@@ -215,7 +225,10 @@ class Ridge(CausalBaseline):
         size = 2 + 2 * features.shape[2] + self.followed.shape[1]
         self.own_weight = np.zeros((2 * bins + 1, channels, size))
         self.weight = np.zeros((2 * bins + 1, self.shared(features[:1]).shape[1], channels))
+        self.reach = np.zeros((2 * bins + 1, channels))
         for b in range(2 * bins + 1):
+            seen = np.abs(np.where(found.at == b, found.change, 0.0)).max(axis=0, initial=0.0)
+            self.reach[b] = np.maximum(seen, self.reach[b - bins] if bins <= b < 2 * bins else 0.0)
             if bins <= b < 2 * bins:
                 self.own_weight[b] = self.own_weight[b - bins]
                 self.weight[b] = self.weight[b - bins]
@@ -238,9 +251,9 @@ class Ridge(CausalBaseline):
                 )
 
     def _columns(self, group: list[int], alike: Array, each: int) -> NDArray[np.int64]:
-        """The shared features that predict these channels: of 32 channels, of less in wide logs."""
+        """The shared features that predict these channels: of the channels most like them."""
         channels = len(alike)
-        most = max(len(group), int(np.clip(1000 // channels, 12, 32)))
+        most = max(len(group), min(max(1000 // channels, 12), self.most_inputs))
         inputs = np.sort(np.argsort(-alike[group].max(axis=0), kind="stable")[:most])
         columns = (inputs[:, None] * each + np.arange(each)).ravel()
         return np.append(columns, channels * each)

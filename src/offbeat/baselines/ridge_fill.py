@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from offbeat.baselines.base import BASELINES, Array, Baseline, padded
 from offbeat.baselines.examples import FOLDS, likeness, some_tasks
 from offbeat.baselines.folds import row_folds
-from offbeat.baselines.gaps import EACH, OWN, SIZE, Gaps, longest_gap
+from offbeat.baselines.gaps import EACH, OWN, SIZE, Gaps
 from offbeat.baselines.held_out import Products
-from offbeat.baselines.history import AgeBins, typical_gap
+from offbeat.baselines.history import AgeBins, longest_gap, typical_gap
 from offbeat.baselines.ridge import Ridge
 from offbeat.data.arrays import hand_over
 from offbeat.data.trajectory import Dataset, Trajectory
@@ -33,6 +33,7 @@ class _End(Ridge):
 
     most_states = 15_000
     most_examples = 3_000
+    most_inputs = 12
 
 
 class RidgeFill(Baseline):
@@ -53,7 +54,8 @@ class RidgeFill(Baseline):
     Weights differ between channels, bins of :math:`g`, and whether others are observed more densely
     than the channel at the value and its neighbours, or only somewhere in the gap, or nowhere.
     Penalties are chosen on held-out trajectories: first for own features, then for all, of all
-    three kinds together, and then of each. Outside all observations of a channel, `Ridge` predicts,
+    three kinds together, and then of each. No value is further from the line than any was in
+    training. Outside all observations of a channel, `Ridge` predicts,
     forwards or backwards.
     """
 
@@ -64,7 +66,7 @@ class RidgeFill(Baseline):
     near: NDArray[np.int64]  # (channels, others)
     limits: Array  # (2, channels, features)
     weight: Array  # (kinds * bins, channels, features)
-    bound: Array  # (2, channels) lowest and highest prediction
+    reach: Array = np.full((1, 1), np.inf)  # (kinds * bins, channels) farthest from the line
     forward: Ridge
     backward: Ridge
 
@@ -76,12 +78,15 @@ class RidgeFill(Baseline):
         for rows in padded(dataset, SIZE):
             gaps = Gaps(rows, self.mean, self.scale)
             filled = gaps.line * self.scale + self.mean
+            reach = np.broadcast_to(self.reach, self.weight.shape[:2])
             for c in range(dataset.channels):
                 task, row = gaps.inside(c)
                 features = np.clip(self._features(gaps, c, task, row), *self.limits[:, c])
-                change = (features * self.weight[self._key(gaps, c, task, row), c]).sum(axis=1)
+                key = self._key(gaps, c, task, row)
+                change = (features * self.weight[key, c]).sum(axis=1)
+                # Beyond what was fitted to, a bend is no larger than those that were seen.
+                change = np.clip(change, -reach[key, c], reach[key, c])
                 filled[task, row, c] += change * self.scale[c]
-            filled = np.clip(filled, *self.bound)
             filled = np.where(rows.observed, rows.values, filled)
             first = len(result)
             for i, length in enumerate(rows.lengths):
@@ -95,7 +100,6 @@ class RidgeFill(Baseline):
         self.forward, self.backward = _End(), _End()
         self.forward.fit(tasks)
         self.backward.fit(backwards(tasks))
-        self.bound = self.forward.bound
         some = some_tasks(tasks, CELLS / tasks.channels)  # the first measure the features
         alike = np.argsort(-likeness(some), axis=1, kind="stable")
         self.near = np.ascontiguousarray(alike[:, 1 : NEAR + 1])
@@ -106,6 +110,7 @@ class RidgeFill(Baseline):
         counts = np.zeros((KINDS * bins, channels, FOLDS))
         folds = row_folds(some, FOLDS)
         self.limits = np.zeros((2, channels, size))
+        self.reach = np.zeros((KINDS * bins, channels))
         measured = np.zeros(channels, dtype=bool)
         first = 0
         for rows in padded(some, SIZE):
@@ -127,7 +132,9 @@ class RidgeFill(Baseline):
                 truth = (rows.values[task, row, c] - self.mean[c]) / self.scale[c]
                 both = np.column_stack([features, truth - gaps.line[task, row, c]])
                 key = self._key(gaps, c, task, row)
-                place = np.where(rows.known[task, row, c], key * FOLDS + fold[task, row], -1)
+                known = rows.known[task, row, c]
+                np.maximum.at(self.reach[:, c], key[known], np.abs(both[known, -1]))
+                place = np.where(known, key * FOLDS + fold[task, row], -1)
                 for one in np.unique(place[place >= 0]).tolist():
                     some = both[place == one]
                     products[one // FOLDS, c, one % FOLDS] += some.T @ some
@@ -136,6 +143,7 @@ class RidgeFill(Baseline):
         for b in range(bins):
             for c in range(channels):
                 every = range(b, KINDS * bins, bins)
+                self.reach[every, c] = self.reach[every, c].max()
                 start = _steps(
                     products[every, c].sum(axis=0), counts[every, c].sum(axis=0), np.zeros(size)
                 )
@@ -160,7 +168,7 @@ class RidgeFill(Baseline):
 
     def arrays(self) -> dict[str, Array]:
         """See `Baseline`."""
-        names = ("edges", "near", "limits", "weight", "bound")
+        names = ("edges", "near", "limits", "weight", "reach")
         return {
             **super().arrays(),
             **{name: getattr(self, name) for name in names},
