@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from offbeat.models.checkpoint import save_model
 from offbeat.models.corrected import CorrectedModel
 from offbeat.models.model import Model
 from offbeat.models.zoo import make_model, recipe_of
+from offbeat.progress import Clock
 from offbeat.run import LADDER
 from offbeat.training import FitResult, fit
 
@@ -281,13 +281,13 @@ class _Ladder:
         """Time of a training step and of the drawing of its tasks, after a first epoch."""
         tasks = _TIMED_STEPS * self.recipe.batch_size
         config = replace(self.config, tasks_per_epoch=tasks, epochs=3, checkpoint_every=None)
-        ends: list[float] = []
+        ends: list[Clock] = []
         fit(
             self.made(candidate),
             self.train,
             config=config,
             baselines=self.baselines,
-            callbacks=[lambda *_: ends.append(time.perf_counter())],
+            callbacks=[lambda *_: ends.append(Clock())],
             progress=False,
         )
         return max((ends[2] - ends[0]) / (2 * _TIMED_STEPS), 1e-6)

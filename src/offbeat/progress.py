@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -94,3 +95,18 @@ def busy(what: str, show: bool = True) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+class Clock:
+    """A moment, for the time of a computation that other programs do not make longer.
+
+    The difference of two moments is the time that passed, or the time that this process computed
+    where that is less: on a busy machine it waits, and with several threads it computes at once.
+    """
+
+    def __init__(self) -> None:
+        self.passed, self.computed = time.perf_counter(), time.process_time()
+
+    def __sub__(self, earlier: Clock) -> float:
+        """s since an earlier moment."""
+        return min(self.passed - earlier.passed, self.computed - earlier.computed)
