@@ -108,5 +108,5 @@ class Clock:
         self.passed, self.computed = time.perf_counter(), time.process_time()
 
     def __sub__(self, earlier: Clock) -> float:
-        """s since an earlier moment."""
+        """Time since an earlier moment, in s."""
         return min(self.passed - earlier.passed, self.computed - earlier.computed)
