@@ -24,7 +24,7 @@ from offbeat.baselines import fit_baseline
 from offbeat.errors import one_of
 from offbeat.files import write_json
 
-from . import report, scores
+from . import figures, report, scores
 from .data import FRACTIONS, Hopper
 from .models import PLANS, train
 
@@ -43,7 +43,11 @@ def main(given: list[str] | None = None) -> None:
     add("--out", type=Path, default=ROOT / "results" / "robots" / "hopper")
     add("--runs", type=Path, default=Path("runs/hopper"), help="folder of checkpoints")
     add("--trajectories", type=int, help="fewer than 10,000, for a trial")
-    add("--document", type=Path, help="a page whose table is written anew")
+    add(
+        "--document",
+        type=Path,
+        help="a page whose tables are written anew, with a figure beside it",
+    )
     options = parser.parse_args(given)
     names = [name for name in options.only.split(",") if name]
     for name in names:
@@ -58,8 +62,9 @@ def main(given: list[str] | None = None) -> None:
             _run(name, hopper, fractions, options)
     if options.document:
         text = options.document.read_text(encoding="utf-8")
-        page = report.document(text, report.read(options.out, ROOT / "results" / "thesis"))
-        options.document.write_text(page, encoding="utf-8")
+        found = report.read(options.out, ROOT / "results" / "thesis")
+        options.document.write_text(report.document(text, found), encoding="utf-8")
+        figures.draw(found, options.document.parent / "figures" / "hopper_curves.png")
 
 
 def _run(name: str, hopper: Hopper, fractions: list[float], options: argparse.Namespace) -> None:

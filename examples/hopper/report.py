@@ -15,7 +15,7 @@ from examples.real_logs.report import document as between
 from offbeat.tables import markdown
 
 from .data import CHANNELS, FRACTIONS, PROTOCOL
-from .models import PLANS
+from .models import ABLATION, PLANS
 from .scores import AGES, record
 
 RECORDED = {
@@ -67,6 +67,7 @@ def document(text: str, found: dict[str, Any]) -> str:
     """
     for name, table in (
         ("errors", errors(found)),
+        ("ablation", ablation(found)),
         ("curves", curves(found)),
         ("since observation", ages(found)),
         ("contacts", contacts(found)),
@@ -79,7 +80,7 @@ def document(text: str, found: dict[str, Any]) -> str:
 def errors(found: dict[str, Any]) -> str:
     """A row per predictor and a column per fraction: test RMSE after the first observation."""
     rows = []
-    for name, each in found["own"].items():
+    for name, each in _main(found):
         cells = [
             _over([run["scores"].get(str(f), {}).get("rmse") for run in each]) for f in FRACTIONS
         ]
@@ -101,15 +102,41 @@ def errors(found: dict[str, Any]) -> str:
     return markdown(head, rows)
 
 
+def ablation(found: dict[str, Any]) -> str:
+    """A row per plan of `ABLATION`: errors, size and minutes, and the first one's error beside."""
+    rows, first = [], None
+    for name in ABLATION:
+        if name not in found["own"]:
+            rows.append([PLANS[name].title, *["not run"] * len(FRACTIONS), "", "", ""])
+            continue
+        each = found["own"][name]
+        cells = [
+            _over([run["scores"].get(str(f), {}).get("rmse") for run in each]) for f in FRACTIONS
+        ]
+        error = np.mean([run["scores"]["0.3"]["rmse"] for run in each])
+        first = error if first is None else first
+        rows.append(
+            [
+                PLANS[name].title,
+                *cells,
+                f"{100 * (error / first - 1):+.0f} %" if name != ABLATION[0] else "",
+                _minutes(each),
+                f"{_size(each[0]):,}",
+            ]
+        )
+    head = ["", *(f"{100 * f:.0f} %" for f in FRACTIONS), "at 30 %", "minutes", "numbers"]
+    return markdown(head, rows)
+
+
 def curves(found: dict[str, Any]) -> str:
     """Validation RMSE at 30 % of the trained models, a column per part of the training."""
-    parts = (1, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100)
+    parts = (1, 5, 10, 20, 40, 60, 80, 100, 120, 150)
     rows = [
         [
             _title(name) + (f", seed {run['seed']}" if run["seed"] else ""),
             *(f"{run['curve'][n - 1]:.4f}" if n <= len(run["curve"]) else "" for n in parts),
         ]
-        for name, each in found["own"].items()
+        for name, each in _main(found)
         for run in each
         if "curve" in run
     ]
@@ -122,7 +149,7 @@ def ages(found: dict[str, Any]) -> str:
     spans = [str(b) if a == b else f"{a} to {b}" for a, b in zip(low, AGES, strict=True)]
     spans[-1] = f"over {AGES[-2]}"
     rows, counted = [], None
-    for name, each in found["own"].items():
+    for name, each in _main(found):
         runs = [run["scores"]["0.3"] for run in each if "0.3" in run["scores"]]
         if not runs:
             continue
@@ -143,7 +170,7 @@ def ages(found: dict[str, Any]) -> str:
 def contacts(found: dict[str, Any]) -> str:
     """Where the squared error is, at the largest and the smallest fraction."""
     rows = []
-    for name, each in found["own"].items():
+    for name, each in _main(found):
         for fraction in (0.9, 0.3):
             scored = [run["scores"].get(str(fraction), {}) for run in each]
             runs = [found for found in scored if "near_switch_rows" in found]
@@ -188,6 +215,11 @@ def runs(found: dict[str, Any]) -> str:
                 ]
             )
     return markdown(["", "seed", "epochs", "processor", "command"], rows)
+
+
+def _main(found: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
+    """Names and results of all predictors but those of the ablation."""
+    return [(name, each) for name, each in found["own"].items() if name not in ABLATION]
 
 
 def _parameters(label: str) -> int:
