@@ -18,7 +18,6 @@ LINES = {"ridge": "ridge", "residual_gru": "residual GRU"}
 
 _COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#882255")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1.2)))
-_LIMITS = (0.006, 0.04)
 
 
 def draw(found: dict[str, Any], path: Path) -> bool:
@@ -33,24 +32,26 @@ def draw(found: dict[str, Any], path: Path) -> bool:
     """
     own = found["own"]
     parts = [
-        ("the large model", [n for n in PLANS if n in own and n not in ABLATION]),
-        ("changed in one thing", [n for n in ABLATION if n in own]),
+        ("the large model", (0.006, 0.03), [n for n in PLANS if n in own and n not in ABLATION]),
+        ("changed in one thing", (0.013, 0.03), [n for n in ABLATION if n in own]),
     ]
-    parts = [(title, names) for title, names in parts if names]
+    parts = [part for part in parts if part[2]]
     if not parts:
         return False
     with rc_context(RC):
         figure = Figure(figsize=(PAGE_WIDTH, 3.4), layout="constrained")
-        panels = figure.subplots(1, len(parts), sharey=True, squeeze=False)[0]
-        for panel, (title, names) in zip(panels, parts, strict=True):
-            _panel(panel, title, names, own)
+        panels = figure.subplots(1, len(parts), squeeze=False)[0]
+        for panel, (title, limits, names) in zip(panels, parts, strict=True):
+            _panel(panel, title, limits, names, own)
         panels[0].set_ylabel("validation RMSE, 30 % observed")
     path.parent.mkdir(parents=True, exist_ok=True)
     save(figure, path)
     return True
 
 
-def _panel(panel: Any, title: str, names: list[str], own: dict[str, Any]) -> None:
+def _panel(
+    panel: Any, title: str, limits: tuple[float, float], names: list[str], own: dict[str, Any]
+) -> None:
     for i, name in enumerate(names):
         for k, run in enumerate(own[name]):
             curve = run["curve"]
@@ -62,8 +63,8 @@ def _panel(panel: Any, title: str, names: list[str], own: dict[str, Any]) -> Non
                 linewidth=1.4 if not k else 0.8,
                 label=None if k else PLANS[name].title.removeprefix("anchored, "),
             )
-    panel.set(title=title, xlabel="epoch", yscale="log", ylim=_LIMITS)
-    plain_ticks(panel.yaxis, _LIMITS)
+    panel.set(title=title, xlabel="epoch", yscale="log", ylim=limits, xlim=(0, None))
+    plain_ticks(panel.yaxis, limits)
     for name, label in LINES.items():
         runs = own.get(name, [])
         score = runs[0]["scores"].get("0.3") if runs else None
@@ -72,4 +73,4 @@ def _panel(panel: Any, title: str, names: list[str], own: dict[str, Any]) -> Non
             where = {"transform": panel.get_yaxis_transform(), "fontsize": 7.5, "color": INK}
             up = "bottom" if name == "ridge" else "top"
             panel.text(0.99, score["rmse"], label, ha="right", va=up, **where)
-    panel.legend(loc="lower left", fontsize=7.5)
+    panel.legend(loc="lower left", fontsize=7)
