@@ -112,8 +112,9 @@ def smooth(
         initial_state_covariance=np.diag(10.0 ** (4 * np.arange(n))),
     ).smooth(np.where(seen, values / unit, 0.0))
     means, covariances = (np.asarray(each) for each in found)
-    deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, : len(at)])
-    return means[:, : len(at)] * unit + shift, np.maximum(deviation, 1e-9) * unit
+    variances = np.diagonal(covariances, axis1=1, axis2=2)[:, : len(at)]
+    deviation = np.sqrt(np.maximum(variances, 1e-18))  # rounding can leave less than 0
+    return means[:, : len(at)] * unit + shift, deviation * unit
 
 
 def local_linear_trend(problem: Problem, options: Options) -> Answerer:

@@ -46,7 +46,7 @@ def offbeat(problem: Problem, options: Options) -> Answerer:
             dataset(problem.held_out),
             tasks,
             as_it_is=True,
-            training=ob.TrainConfig(epochs=40, seed=options.seed),
+            training=ob.TrainConfig(epochs=20, seed=options.seed),
             baselines=("pchip", "linear", "motion_smoother", "ridge_fill", "last_value", "ridge"),
             **common,
         )

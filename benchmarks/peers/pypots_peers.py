@@ -92,12 +92,14 @@ def imputer(
     from pypots.utils.random import set_random_seed
 
     set_random_seed(options.seed)
-    rows = min(ROWS, *(len(s.times) for task in problem.asked.values() for s in task[:1]))
+    fills = [s for task in problem.asked if task.startswith("fill") for s in problem.asked[task]]
+    rows = min(ROWS, *(len(s.times) for s in (*problem.fit, *problem.held_out, *fills)))
     model = kind(rows, len(problem.channels), **sizes, **COMMON)
     rng = np.random.default_rng(options.seed)
     if problem.hidden == "dropouts":
         # Its own training masks are single values, which is worse on every log.
-        masks.mcar = lambda x, p: _dropouts(x, problem, rng)
+        length = max(round(0.5 / problem.step_s), 1)
+        masks.mcar = lambda x, p: _dropouts(x, problem.sensors, length, rng)
     train = _windows(problem, problem.fit, rows, truth=own_masks)
     train = np.tile(train, (-(-WINDOWS // len(train)), 1, 1))
     validation = {
@@ -144,10 +146,10 @@ def _windows(
     return np.stack(found).astype(np.float32)
 
 
-def _dropouts(x: Any, problem: Problem, rng: np.random.Generator) -> Any:
-    """A window with 30 % of each sensor hidden in dropouts of 0.5 s."""
-    hidden, length = x.clone(), max(round(0.5 / problem.step_s), 1)
-    for sensor in problem.sensors:
+def _dropouts(x: Any, sensors: Sequence[Sequence[int]], length: int, rng: Any) -> Any:
+    """A window with about 30 % of each sensor hidden, in dropouts of this many rows."""
+    hidden = x.clone()
+    for sensor in sensors:
         for start in rng.permutation(len(x))[: max(round(0.36 * len(x) / length), 1)]:
             hidden[start : start + length, list(sensor)] = float("nan")
     return hidden

@@ -164,7 +164,8 @@ PEERS: Mapping[str, Peer] = {
         ("offbeat", "torch"),
         BOTH,
         False,
-        "what `ob.learn` does to a log, on these parts; Hopper: 40 epochs of the anchored model",
+        "what `ob.learn` does to a log, on these parts; on the hopper six baselines and 20 epochs "
+        "each way of the anchored model",
     ),
 }
 """Peers by name, in the order of the tables."""

@@ -81,7 +81,6 @@ def run(
         "tasks": made_of,
         "command": f"python -m benchmarks.peers run --log {log} --peer {peer} "
         f"--seed {options.seed} --budget_s {options.budget_s:g}",
-        "settings": entry.settings,
         "lines": entry.lines(),
         "commit": commit(),
         "cpu": cpu(),
@@ -94,7 +93,10 @@ def run(
             result |= json.loads((Path(folder) / "cost.json").read_text(encoding="utf-8"))
             with np.load(Path(folder) / "answers.npz", allow_pickle=False) as file:
                 answers = {name: file[name] for name in file.files}
-            result["scores"] = score(load(inputs), truth, answers)
+            try:
+                result["scores"] = score(load(inputs), truth, answers)
+            except ValueError as error:
+                result["error"] = str(error)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, result)
     return result
@@ -135,7 +137,7 @@ def score(
         number, and with intervals `coverage_90` and `width_90_scaled`.
 
     Raises:
-        ValueError: an answer is missing.
+        ValueError: an answer is missing, or an interval is not finite.
     """
     found: dict[str, Any] = {}
     with np.load(truth, allow_pickle=False) as file:
@@ -157,6 +159,8 @@ def score(
         }
         if f"{task}|low" in answers:
             low, high = answers[f"{task}|low"], answers[f"{task}|high"]
+            if not np.isfinite((high - low)[known]).all():
+                raise ValueError(f"{task}: some intervals are not finite")
             inside = (low <= hidden[task]) & (hidden[task] <= high)
             scores["coverage_90"] = float(inside[known].mean())
             scores["width_90_scaled"] = float(((high - low) / problem.scale)[known].mean())

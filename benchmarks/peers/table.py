@@ -81,7 +81,7 @@ def settings(out: Path) -> str:
             if package != "python"
         }
         command = re.sub(r"--log \w+", "--log LOG", ran[0]["command"])
-        said = [peer.title, ", ".join(sorted(versions)), ran[0]["settings"], f"`{command}`"]
+        said = [peer.title, ", ".join(sorted(versions)), peer.settings, f"`{command}`"]
         lines.append(_line(said))
     return "\n".join(lines)
 
