@@ -10,6 +10,7 @@ from typing import Any
 from offbeat.answers.backward import fit_backward
 from offbeat.answers.blend import Blend, by_direction, fit_blend
 from offbeat.answers.saved import BACKWARD, save_blend
+from offbeat.baselines.base import BASELINES
 from offbeat.baselines.history import typical_gap
 from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig, check_seed
 from offbeat.data.masking import masked_values
@@ -20,11 +21,11 @@ from offbeat.data.trajectory import Dataset
 from offbeat.ladder import CANDIDATES, LadderResult, fit_ladder
 from offbeat.models.base import BaseModel
 from offbeat.models.zoo import make_model
-from offbeat.progress import busy
+from offbeat.progress import Clock, busy
 from offbeat.training import FitResult, fit
 
 BUDGET_S = 240.0
-"""s, default time for the trainings of a log, on one thread."""
+"""s, default time for the trainings and the blend of a log, on one thread."""
 
 SIMPLE = ("last_value", "mean", "constant_velocity", "damped_slope", "linear", "pchip")
 """Baselines of the blend of a data set as it is: those that are fitted at once."""
@@ -35,8 +36,11 @@ GAUSSIAN = (
 )
 """Said where a model has a standard deviation of its own."""
 
+_TRAINING_SHARE = 0.6
+"""Part of the budget for the trainings; the rest is for baselines, weights and intervals."""
+
 _FORWARD_SHARE = 0.7
-"""Part of the budget for the ladder and the forward model; the rest is for the backward one."""
+"""Part of that for the ladder and the forward model; the rest is for the backward one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +106,10 @@ def learn(
         baselines: names of those in the blend; by default all that are not slow, and `SIMPLE` ones
             for a data set as it is.
         scaler: of the models; by default robust, and standardise for a data set as it is.
-        budget_s: s, time for the trainings on one thread of this machine, about. The number of
-            epochs follows from it and from the time of a step; a model that is given is trained by
-            its recipe.
+        budget_s: s, time for all of it on one thread of this machine, about. The number of epochs
+            follows from six tenths of it and from the time of a step; a model that is given is
+            trained by its recipe. Baselines that would take longer than the rest are left out,
+            unless they are named, and a note says which.
         seed: of the initial weights, and of tasks.
         device: as of `fit`.
         progress: show progress bars.
@@ -151,7 +156,8 @@ def learn(
         two_sided=two_sided,
         baselines=baselines,
         scaler=scaler,
-        budget_s=budget_s,
+        budget_s=_TRAINING_SHARE * budget_s,
+        limit_s=budget_s,
         seed=seed,
         device=device,
         progress=progress,
@@ -173,6 +179,7 @@ def train_blend(
     baselines: Sequence[str] | None = None,
     scaler: ScalerKind | Scaler | None = None,
     budget_s: float = BUDGET_S,
+    limit_s: float | None = None,
     seed: int = 0,
     device: str | None = None,
     progress: bool = True,
@@ -191,6 +198,8 @@ def train_blend(
         baselines: names of those in the blend.
         scaler: of the models.
         budget_s: s, for the trainings.
+        limit_s: s, for all of it: baselines are left out that would take longer than what the
+            trainings leave, or than the part of the limit that is never theirs. None fits all.
         seed: of weights and tasks.
         device: to train on.
         progress: show progress bars.
@@ -199,7 +208,7 @@ def train_blend(
         The blend, the training of the forward model, and sentences on the choice of the model,
         and those of `Blend.notes`.
     """
-    folder = Path(out) if out is not None else None
+    folder, started = Path(out) if out is not None else None, Clock()
     kind: Any = scaler or ("standardise" if as_it_is else "robust")
     common: dict[str, Any] = {"device": device, "progress": progress}
     config = training or TrainConfig(seed=seed)
@@ -245,6 +254,9 @@ def train_blend(
     masked = any(masked_values(t).any() for t in train)
     names = SIMPLE if baselines is None and as_it_is else baselines
     members: dict[str, Any] = {} if names is None else by_direction(names)
+    left = None
+    if limit_s is not None and names is None:
+        left = max(limit_s - (Clock() - started), (1 - _TRAINING_SHARE) * limit_s)
     with busy("fitting baselines, weights and intervals", progress):
         blend = fit_blend(
             train,
@@ -253,12 +265,27 @@ def train_blend(
             backward,
             tasks=tasks,
             masks_of_data=as_it_is and masked,
+            budget_s=left,
             seed=seed,
             **members,
         )
     if folder is not None:
         save_blend(blend, folder)
-    return blend, fitted, (*said, *blend.notes())
+    return blend, fitted, (*said, *_left_out(blend, left), *blend.notes())
+
+
+def _left_out(blend: Blend, budget_s: float | None) -> tuple[str, ...]:
+    """A sentence on the baselines for which there was no time."""
+    if budget_s is None:
+        return ()
+    fitted = {*blend.stack.members, *blend.both.members}
+    out = [name for name, kind in BASELINES.items() if not kind.slow and name not in fitted]
+    if not out:
+        return ()
+    return (
+        f"not fitted in the {budget_s:.2g} s that were left for baselines: {', '.join(out)}; a "
+        "larger budget (--budget_minutes) has time for them, and --baselines fits those it names",
+    )
 
 
 def _said(result: LadderResult) -> str:

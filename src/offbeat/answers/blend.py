@@ -45,6 +45,7 @@ from offbeat.data.tasks import CAUSAL, TWO_SIDED, TaskConfig, draw_tasks
 from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
 from offbeat.models.base import BaseModel, of_channels
+from offbeat.progress import Clock
 from offbeat.tables import plain
 
 GIVEN_CAUSAL = {"logged": 0.5, "cut": 0.5}
@@ -306,6 +307,7 @@ def fit_blend(
     two_sided: Sequence[str] | None = None,
     masks_of_data: bool = False,
     count: int = TASKS,
+    budget_s: float | None = None,
     seed: int = 0,
 ) -> Blend:
     """Fits the base to training and validation data, and gamma and intervals to validation data.
@@ -323,11 +325,14 @@ def fit_blend(
         masks_of_data: the data has masked values like those that will be asked for, so that no
             others are masked than those after a cut.
         count: tasks that are drawn from each part, at most.
+        budget_s: s, time for all of it, about; baselines that would take longer are left out, the
+            costly ones first. None fits all.
         seed: of the tasks.
 
     Raises:
         InputError: the parts have other channels than the model.
     """
+    started = Clock()
     train, validation = Dataset.of(train), Dataset.of(validation)
     transforms = model.transforms if model is not None else Transforms.of(train)
     if model is not None:
@@ -358,7 +363,10 @@ def fit_blend(
     if two_sided is None:
         two_sided = tuple(name for name, kind in usual.items() if not kind.causal)
     parts = drawn(before, 0)
-    stack, cells, held_out, source = fit_stack(causal, *parts, span_s=span, gap_s=gap)
+    half = None if budget_s is None else budget_s / 2
+    stack, cells, held_out, source = fit_stack(
+        causal, *parts, span_s=span, gap_s=gap, budget_s=half
+    )
     models = model_rows(model, parts[1], seed=seed)
     count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
     errors = replace(errors_of(cells, [held_out], count_of, stack.keys.groups), source=source)
@@ -389,12 +397,16 @@ def fit_blend(
         )
         for part in drawn(both, 1)
     ]
-    return replace(
-        blend,
-        both=fit_both_sides(
-            two_sided, sides[0], sides[1], span_s=span, validation_span_s=validation_span, gap_s=gap
-        ),
+    left = None if budget_s is None else budget_s - (Clock() - started)
+    sided = fit_both_sides(
+        two_sided,
+        *sides,
+        span_s=span,
+        validation_span_s=validation_span,
+        gap_s=gap,
+        budget_s=left,
     )
+    return replace(blend, both=sided)
 
 
 def by_direction(names: Sequence[str]) -> dict[str, tuple[str, ...]]:

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
 from offbeat.baselines.base import Array, Baseline, fit_baseline
-from offbeat.baselines.folds import cross_fitted
 from offbeat.baselines.history import AgeBins, usual_gaps
+from offbeat.baselines.members import fit_members
 from offbeat.baselines.stack import (
     arrays_of,
     independent_tasks,
@@ -250,6 +250,7 @@ def fit_both_sides(
     span_s: float,
     validation_span_s: float,
     gap_s: float,
+    budget_s: float | None = None,
 ) -> BothSides:
     """Fits weights to training and validation tasks, gamma and intervals to validation tasks.
 
@@ -260,19 +261,15 @@ def fit_both_sides(
         span_s: s, length of all the data.
         validation_span_s: s, length of the validation data.
         gap_s: s, its typical gap.
+        budget_s: s, for the fits; see `fit_members`.
     """
     channels = train.tasks.channels
     lengths = longest_lengths(train.tasks)
     usual = float(np.quantile(lengths, 0.95)) if lengths else gap_s
     keys = SideKeys(AgeBins.of_lengths(gap_s, usual, max(lengths, default=gap_s)))
-    fitted, predicted, later = {}, [], []
-    for name in members:
-        fitted[name] = fit_baseline(name, train.tasks)
-        flexible = fitted[name].flexible
-        predicted.append(
-            cross_fitted(name, train.tasks) if flexible else fitted[name].predict(train.tasks)
-        )
-        later.append(fitted[name].predict(validation.tasks))
+    found = fit_members(members, train.tasks, validation.tasks, budget_s=budget_s)
+    fitted = {name: member.baseline for name, member in found.items()}
+    predicted, later = [m.train for m in found.values()], [m.validation for m in found.values()]
     count = independent_tasks(keys.lengths(), span_s, gap_s)
     reference = fit_baseline("linear", train.tasks)
     scale = reference.scale

@@ -37,6 +37,7 @@ class Baseline(ABC):
             are smaller than those on others; then weights are fitted to cross-validated errors.
         slow: whether its fit takes much longer than those of the others; then it is used where it
             is asked for by name.
+        cost: time of its fits and predictions, about, relative to those of `damped_slope`.
         mean: (channels,) mean of the observed values of training, in units of the channels.
         scale: (channels,) their standard deviation; 1 where a channel is constant.
     """
@@ -44,6 +45,7 @@ class Baseline(ABC):
     causal: ClassVar[bool] = True
     flexible: ClassVar[bool] = False
     slow: ClassVar[bool] = False
+    cost: ClassVar[float] = 1.0
 
     mean: Array
     scale: Array

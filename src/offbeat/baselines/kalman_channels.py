@@ -250,6 +250,8 @@ class ChainBaseline(Baseline):
         banks: chains of one order each.
     """
 
+    cost = 20.0
+
     banks: tuple[Chains, ...]
 
     def assembled(self, means: Sequence[Sequence[Any]]) -> Any:
@@ -333,6 +335,7 @@ class ChainSmoother(ChainBaseline):
     """A Rauch-Tung-Striebel smoother of chains."""
 
     causal = False
+    cost = 6.0
 
     def predict(self, dataset: Dataset) -> list[Array]:
         """See `Baseline`. At an observed row, the smoothed value."""

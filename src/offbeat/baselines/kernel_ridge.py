@@ -36,6 +36,8 @@ class KernelRidge(Ridge):
     are 400 centres for up to 4 channels, fewer for more, and 100 from 16 on.
     """
 
+    cost = 120.0
+
     centres: Array  # (centres, inputs)
     root: Array  # (centres, centres) K(C, C)^(-1/2)
 

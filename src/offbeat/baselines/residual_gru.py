@@ -47,6 +47,7 @@ class ResidualGru(CausalBaseline):
 
     flexible = True
     slow = True
+    cost = 200.0
 
     gap: Array  # () s, typical one
     edges: Array  # (bins,) s, of AgeBins

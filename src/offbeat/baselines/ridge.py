@@ -62,6 +62,7 @@ class Ridge(CausalBaseline):
     """
 
     flexible = True
+    cost = 60.0
 
     most_states: ClassVar[int] = 50_000  # of the tasks, that a fit uses
     most_examples: ClassVar[int] = 6_000  # of a channel in a bin

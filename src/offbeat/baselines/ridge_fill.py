@@ -61,6 +61,7 @@ class RidgeFill(Baseline):
 
     causal = False
     flexible = True
+    cost = 30.0
 
     edges: Array  # (bins,) s, of gaps
     near: NDArray[np.int64]  # (channels, others)

@@ -15,15 +15,14 @@ from offbeat.baselines.base import (
     Baseline,
     CausalBaseline,
     State,
-    fit_baseline,
     moments,
     namespace,
     padded,
     stepped,
 )
-from offbeat.baselines.folds import cross_fitted
 from offbeat.baselines.history import AgeBins, History, usual_gaps
 from offbeat.baselines.local_scale import LocalScale
+from offbeat.baselines.members import fit_members
 from offbeat.baselines.simple import as_index, as_kind, channels_of
 from offbeat.baselines.weights import Errors, as_if_refitted, simplex_weights, sources
 from offbeat.data.trajectory import Dataset
@@ -325,6 +324,7 @@ def fit_stack(
     *,
     span_s: float,
     gap_s: float,
+    budget_s: float | None = None,
 ) -> tuple[Stack, Cells, list[Array], NDArray[np.int64]]:
     """Fits causal baselines to training tasks, and their weights to training and validation tasks.
 
@@ -336,6 +336,7 @@ def fit_stack(
         validation: tasks of other data.
         span_s: s, length of the data that all tasks were drawn from.
         gap_s: s, its typical gap.
+        budget_s: s, for the fits; see `fit_members`.
 
     Returns:
         The stack, the values of the validation tasks, the stack's predictions of these tasks with
@@ -346,14 +347,11 @@ def fit_stack(
     stack.low, stack.high = bounds(train)
     stack.keys = Keys(AgeBins.of(train), LocalScale().fit(train))
     stack.members = {}
-    predicted: list[list[Array]] = []
-    later: list[list[Array]] = []
-    for name in members:
-        member = fit_baseline(name, train)
-        assert isinstance(member, CausalBaseline)
-        stack.members[name] = member
-        predicted.append(cross_fitted(name, train) if member.flexible else member.predict(train))
-        later.append(member.predict(validation))
+    found = fit_members(members, train, validation, budget_s=budget_s)
+    for name, member in found.items():
+        assert isinstance(member.baseline, CausalBaseline)
+        stack.members[name] = member.baseline
+    predicted, later = [m.train for m in found.values()], [m.validation for m in found.values()]
     count = independent_tasks(stack.keys.ages(), span_s, gap_s)
     cells = [stack.keys.cells(tasks) for tasks in (train, validation)]
     errors = [

@@ -57,7 +57,7 @@ def train_command(
         baselines: names of the simple predictors that answers are blended with, such as
             [last_value,ridge,pchip]; by default all for logs, and those that are fitted at once
             for a data set of Offbeat.
-        budget_minutes: time for the trainings, about, where the model is chosen.
+        budget_minutes: time for trainings, baselines and blend, about, where the model is chosen.
         reader: how the log is read; the run keeps these options for the other commands.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
