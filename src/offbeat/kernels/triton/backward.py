@@ -179,16 +179,17 @@ def evaluate_backward(acts, deltas, w, layers, bounds, c: tl.constexpr):
             z = tl.zeros((c.BM, c.BN), tl.float32)
             z = product(z, deltas + at + n_size, weight, k_size, n_size, n, 1, n_size, c)
             here = at + n[None, :]
+            inner = n * 0 + layer > 0
             value = tl.load(acts + here, mask=m, other=0.0)
             if c.SILU:
-                by = tl.load(deltas + here, mask=m & (layer > 0), other=1.0)
+                by = tl.load(deltas + here, mask=m & inner[None, :], other=1.0)
             else:
-                by = tl.where(layer > 0, 1.0 - value * value, 1.0)
+                by = tl.where(inner[None, :], 1.0 - value * value, 1.0)
             if c.BOUNDED:
-                low = tl.load(bounds + n, mask=(n < n_size) & (layer == 0), other=0.0)[None, :]
-                high = tl.load(bounds + c.D + n, mask=(n < n_size) & (layer == 0), other=0.0)[None, :]
+                low = tl.load(bounds + n, mask=(n < n_size) & (inner == 0), other=0.0)[None, :]
+                high = tl.load(bounds + c.D + n, mask=(n < n_size) & (inner == 0), other=0.0)[None, :]
                 within = inside(value, low, high)
-                by = tl.where(layer > 0, by, within)
+                by = tl.where(inner[None, :], by, within)
             tl.store(deltas + here, z * by, mask=m)
         tl.debug_barrier()
 
@@ -287,8 +288,8 @@ def drift_backward(
             by_start = (1.0 - part) * to_reached
             by_end = part * to_reached
             value = s0 + began * (s1 - s0)
-            open_start = (value >= 0) & (value <= 30.0) & (k == untracked)
-            open_start = open_start & (later[:, None] >= untracked)
+            open_start = (value >= 0) & (value <= 30.0) & (later[:, None] >= untracked)
+            open_start = open_start & (began * 0.0 + k == untracked)
             to_began = tl.where(fresh | (open_start == 0), 0.0, to_before)
             by_start += (1.0 - began) * to_began
             by_end += began * to_began
@@ -436,11 +437,12 @@ def scan_backward(
 
         # The states before each step, from the state after the row before.
         if c.DECAY or c.TREND or c.FIELD:
+            later_row = (at * 0 + i > 0)[:, None]
             for n0 in range(0, c.D, c.BN):
                 n = n0 + tl.arange(0, c.BN)[None, :]
                 m = n < c.D
-                earlier = tl.load(after + (row - 1) * c.S + n, mask=ok & m & (i > 0), other=0.0)
-                zeroth = tl.load(state + one[:, None] * c.S + n, mask=ok & m & (i == 0), other=0.0)
+                earlier = tl.load(after + (row - 1) * c.S + n, mask=ok & m & later_row, other=0.0)
+                zeroth = tl.load(state + one[:, None] * c.S + n, mask=ok & m & (later_row == 0), other=0.0)
                 tl.store(y + n, earlier + zeroth, mask=m)
             tl.debug_barrier()
             for k in range(0, count):
