@@ -33,8 +33,8 @@ from offbeat.kernels.triton.steps import (
 @triton.jit
 def add(source, target, units, ok, c: tl.constexpr):
     """Adds a table in global memory to one of the block."""
-    for n0 in range(0, units, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, units, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         total = tl.load(target + n, mask=n < units, other=0.0)
         total += tl.load(source + n, mask=ok & (n < units), other=0.0)
         tl.store(target + n, total, mask=n < units)
@@ -45,8 +45,8 @@ def add(source, target, units, ok, c: tl.constexpr):
 def act_backward(h, memory, gate, inner, g, to_gate, to_inner, w, update, c: tl.constexpr):
     """Gradient of the gates; `g`, of h and the memory, becomes the one before the update."""
     on = update[:, None]
-    for n0 in range(0, c.H, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.H, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         m = n < c.H
         to_new = tl.load(g + n, mask=m, other=0.0)
         first = tl.load(gate + n, mask=m, other=0.0)
@@ -199,8 +199,8 @@ def stages_backward(
     y, acts, deltas, g, moved, w, layers, tab, bounds, span, c: tl.constexpr
 ):  # fmt: skip
     """`g` of the state after a step of the solver becomes the one before it."""
-    for n0 in range(0, c.D, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.D, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         _state, kind = moved_by(y, acts, tab, bounds, span, n, c)
         all_of_it = tl.load(g + n, mask=n < c.D, other=0.0)
         tl.store(moved + n, tl.where(kind > 0, all_of_it, 0.0), mask=n < c.D)
@@ -209,8 +209,8 @@ def stages_backward(
     for p in range(0, c.STAGES):
         j = c.STAGES - 1 - p
         own = j * c.BM * c.E
-        for n0 in range(0, c.D, c.BN):
-            n = n0 + tl.arange(0, c.BN)[None, :]
+        for n0 in range(0, c.D, c.BE):
+            n = n0 + tl.arange(0, c.BE)[None, :]
             m = n < c.D
             total = tl.load(tab + 16 + j) * tl.load(moved + n, mask=m, other=0.0)
             for q in range(j + 1, c.STAGES):
@@ -219,8 +219,8 @@ def stages_backward(
             tl.store(deltas + own + c.last + n, total * span[:, None], mask=m)
         tl.debug_barrier()
         evaluate_backward(acts + own, deltas + own, w, layers, bounds, c)
-    for n0 in range(0, c.D, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.D, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         total = tl.load(g + n, mask=n < c.D, other=0.0)
         for q in range(0, c.STAGES):
             total += tl.load(deltas + q * c.BM * c.E + n, mask=n < c.D, other=0.0)
@@ -235,8 +235,8 @@ def drift_backward(
 ):  # fmt: skip
     """`g` of the state after `drift` becomes the one before it; `source` is that state."""
     if c.TREND:
-        for n0 in range(0, c.A, c.BN):
-            n = n0 + tl.arange(0, c.BN)[None, :]
+        for n0 in range(0, c.A, c.BE):
+            n = n0 + tl.arange(0, c.BE)[None, :]
             m = n < c.A
             x = tl.load(source + n, mask=m, other=0.0)
             v = tl.load(source + c.A + n, mask=m, other=0.0)
@@ -256,8 +256,8 @@ def drift_backward(
             tl.store(sums + n, total, mask=ok & m)
             tl.store(g + c.A + n, reach * to_moved + kept * to_v, mask=m)
     if c.DECAY:
-        for n0 in range(0, c.H, c.BN):
-            n = n0 + tl.arange(0, c.BN)[None, :]
+        for n0 in range(0, c.H, c.BE):
+            n = n0 + tl.arange(0, c.BE)[None, :]
             m = n < c.H
             s0 = tl.load(start + n, mask=ok & m, other=0.0)
             s1 = tl.load(end + n, mask=ok & m, other=0.0)
@@ -361,8 +361,8 @@ def scan_backward(
     g = own + c.at_g * c.BM + lane * c.S
     own_sums = sums + one[:, None] * (3 * c.A)
 
-    for n0 in range(0, c.S, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.S, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         given = tl.load(g_state + one[:, None] * c.S + n, mask=ok & (n < c.S), other=0.0)
         tl.store(g + n, given, mask=n < c.S)
     tl.debug_barrier()
@@ -387,8 +387,8 @@ def scan_backward(
         if HAS_AFTER:
             add(to_after + row * c.S, g, c.S, ok, c)
         if c.NODES:  # a state that was not kept leaves that of the node to the next row
-            for n0 in range(0, c.S, c.BN):
-                n = n0 + tl.arange(0, c.BN)[None, :]
+            for n0 in range(0, c.S, c.BE):
+                n = n0 + tl.arange(0, c.BE)[None, :]
                 m = n < c.S
                 given = tl.load(g + n, mask=m, other=0.0)
                 kept = commit[:, None] > 0
@@ -397,8 +397,8 @@ def scan_backward(
             tl.debug_barrier()
         if c.G > 0:
             if c.A > 0 or tl.max(update, axis=0) > 0:
-                for n0 in range(0, c.S, c.BN):
-                    n = n0 + tl.arange(0, c.BN)[None, :]
+                for n0 in range(0, c.S, c.BE):
+                    n = n0 + tl.arange(0, c.BE)[None, :]
                     m = n < c.S
                     arrived = tl.load(before + row * c.S + n, mask=ok & m, other=0.0)
                     tl.store(y + n, arrived, mask=m)
@@ -407,8 +407,8 @@ def scan_backward(
                     innovate(y, innovation, values + row * c.A, mask + row * c.A, bounds, ok, c)
                 gates(y + c.X, innovation, projected + row * c.G, gate, inner, w, ok, c)
                 if c.CELL == "gru" and not c.RESET_AFTER:
-                    for n0 in range(0, c.H, c.BN):
-                        n = n0 + tl.arange(0, c.BN)[None, :]
+                    for n0 in range(0, c.H, c.BE):
+                        n = n0 + tl.arange(0, c.BE)[None, :]
                         m = n < c.H
                         value = tl.load(inner + n, mask=m, other=0.0)
                         tl.store(to_product + row * c.H + n, value, mask=ok & m)
@@ -416,8 +416,8 @@ def scan_backward(
                     y + c.X, y + c.D, gate, inner, g + c.X, to_gate, applied_now, w, update, c
                 )
                 if c.CELL == "gru" and c.RESET_AFTER:
-                    for n0 in range(0, c.H, c.BN):
-                        n = n0 + tl.arange(0, c.BN)[None, :]
+                    for n0 in range(0, c.H, c.BE):
+                        n = n0 + tl.arange(0, c.BE)[None, :]
                         m = n < c.H
                         value = tl.load(applied_now + n, mask=m, other=0.0)
                         tl.store(to_product + row * c.H + n, value, mask=ok & m)
@@ -426,8 +426,8 @@ def scan_backward(
                         y, innovation, g, to_gate, values + row * c.A, mask + row * c.A,
                         level + row * c.A, slope + row * c.A, w, bounds, own_sums, ok, c,
                     )  # fmt: skip
-                for n0 in range(0, c.G, c.BN):
-                    n = n0 + tl.arange(0, c.BN)[None, :]
+                for n0 in range(0, c.G, c.BE):
+                    n = n0 + tl.arange(0, c.BE)[None, :]
                     m = n < c.G
                     value = tl.load(to_gate + n, mask=m, other=0.0)
                     tl.store(to_projected + row * c.G + n, value, mask=ok & m)
@@ -436,10 +436,10 @@ def scan_backward(
             add(to_before + row * c.S, g, c.S, ok, c)
 
         # The states before each step, from the state after the row before.
-        if c.DECAY or c.TREND or c.FIELD:
+        if c.DECAY or c.TREND or c.flow:
             later_row = (at * 0 + i > 0)[:, None]
-            for n0 in range(0, c.D, c.BN):
-                n = n0 + tl.arange(0, c.BN)[None, :]
+            for n0 in range(0, c.D, c.BE):
+                n = n0 + tl.arange(0, c.BE)[None, :]
                 m = n < c.D
                 earlier = tl.load(after + (row - 1) * c.S + n, mask=ok & m & later_row, other=0.0)
                 zeroth = tl.load(state + one[:, None] * c.S + n, mask=ok & m & (later_row == 0), other=0.0)
@@ -458,7 +458,7 @@ def scan_backward(
                             y, y, come, out, start + row * c.H, end + row * c.H, w, bounds, ok,
                             updated, first, span, active, fraction, k, c,
                         )  # fmt: skip
-                    if c.FIELD:
+                    if c.flow:
                         stages(y, redone, redone, w, layers, tab, bounds, span, False, c)
                         combine(y, redone, tab, bounds, span, c)
 
@@ -466,7 +466,7 @@ def scan_backward(
         if c.NODES:
             if reads == 0:
                 add(to_node, g, c.S, ok, c)
-        if c.DECAY or c.TREND or c.FIELD:
+        if c.DECAY or c.TREND or c.flow:
             for q in range(0, count - untracked):
                 k = count - 1 - q
                 if c.NODES:
@@ -476,7 +476,7 @@ def scan_backward(
                 here = tape + place * c.BM * c.D
                 come = tape_applied + tl.maximum(place - 1, 0) * c.BM * c.H
                 span, active, fraction = step_of(gap, first, node, whole, k, c)
-                if c.FIELD:
+                if c.flow:
                     moving = here
                     if c.DECAY or c.TREND:
                         drift(
@@ -502,14 +502,14 @@ def scan_backward(
             if (reads > 0) & (whole == 0):
                 add(to_node, g, c.S, ok, c)
             if untracked > 0:  # no gradient reaches the state before the tracked steps
-                for n0 in range(0, c.D, c.BN):
-                    n = n0 + tl.arange(0, c.BN)[None, :]
+                for n0 in range(0, c.D, c.BE):
+                    n = n0 + tl.arange(0, c.BE)[None, :]
                     value = tl.load(g + n, mask=n < c.D, other=0.0)
                     value = tl.where(later[:, None] < untracked, 0.0, value)
                     tl.store(g + n, value, mask=n < c.D)
                 tl.debug_barrier()
 
-    for n0 in range(0, c.S, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.S, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         value = tl.load(g + n, mask=n < c.S, other=0.0)
         tl.store(g_state + one[:, None] * c.S + n, value, mask=ok & (n < c.S))

@@ -69,8 +69,8 @@ def scan_forward(
     inner = own + c.at_inner * c.BM + lane * c.H
     acts = own + c.at_acts * c.BM + lane * c.E
 
-    for n0 in range(0, c.S, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.S, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         first_state = tl.load(state + one[:, None] * c.S + n, mask=ok & (n < c.S), other=0.0)
         tl.store(y + n, first_state, mask=n < c.S)
     tl.debug_barrier()
@@ -97,14 +97,14 @@ def scan_forward(
                     y, y, applied, applied, start + row * c.H, end + row * c.H, w, bounds, ok,
                     updated, first, span, active, fraction, k, c,
                 )  # fmt: skip
-            if c.FIELD:
+            if c.flow:
                 stages(y, acts, acts, w, layers, tab, bounds, span, False, c)
                 combine(y, acts, tab, bounds, span, c)
         if c.NODES:
             if reads == 0:
                 copy(y, node_state, c.S, c)
-        for n0 in range(0, c.S, c.BN):
-            n = n0 + tl.arange(0, c.BN)[None, :]
+        for n0 in range(0, c.S, c.BE):
+            n = n0 + tl.arange(0, c.BE)[None, :]
             arrived = tl.load(y + n, mask=n < c.S, other=0.0)
             tl.store(before + row * c.S + n, arrived, mask=ok & (n < c.S))
         if c.G > 0:
@@ -118,8 +118,8 @@ def scan_forward(
                 gates(y + c.X, innovation, projected + row * c.G, gate, inner, w, ok, c)
                 act(y + c.X, y + c.D, gate, update, c)
                 tl.debug_barrier()
-        for n0 in range(0, c.S, c.BN):
-            n = n0 + tl.arange(0, c.BN)[None, :]
+        for n0 in range(0, c.S, c.BE):
+            n = n0 + tl.arange(0, c.BE)[None, :]
             new = tl.load(y + n, mask=n < c.S, other=0.0)
             if c.NODES:
                 kept = tl.load(node_state + n, mask=n < c.S, other=0.0)

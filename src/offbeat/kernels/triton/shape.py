@@ -41,8 +41,9 @@ class Shape:
         CONTINUOUS: the exponent of a decay grows with time.
         SEVERAL: a row can take several steps, each after its part of the decay.
         BM: trajectories of a program.
-        BN: units of a tile.
-        BK: units of a tile that are summed at once.
+        BN: units of a tile of products.
+        BK: units that a product sums at once.
+        BE: units of a tile of all else.
         PRECISION: of products, `ieee`, `tf32` or `tf32x3`.
     """
 
@@ -66,6 +67,7 @@ class Shape:
     BM: int
     BN: int
     BK: int
+    BE: int
     PRECISION: str
 
     @classmethod
@@ -101,6 +103,7 @@ class Shape:
             BM=tiles[0],
             BN=tiles[1],
             BK=tiles[2],
+            BE=min(tiles[1], 32),
             PRECISION=precision,
         )
 
@@ -130,6 +133,11 @@ class Shape:
     def recurrent(self) -> bool:
         """Whether h has recurrent weights."""
         return self.CELL in ("elman", "lstm", "gru")
+
+    @property
+    def flow(self) -> bool:
+        """Whether there is a vector field."""
+        return bool(self.FIELD)
 
     @property
     def layers(self) -> int:

@@ -79,8 +79,8 @@ def product(acc, x, w, k_size, k_stride, n, n_stride, n_size, c: tl.constexpr):
 @triton.jit
 def copy(source, target, units, c: tl.constexpr):
     """Copies `units` of each trajectory from table to table."""
-    for n0 in range(0, units, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, units, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         tl.store(target + n, tl.load(source + n, mask=n < units, other=0.0), mask=n < units)
     tl.debug_barrier()
 
@@ -101,7 +101,7 @@ def step_of(gap, first, node, whole, k, c: tl.constexpr):
         active = tl.where(reads, later >= 0, k >= later)
         span = tl.where(reads, gap, tl.where(active, c.MAX_STEP, 0.0))
         fraction = (at * c.MAX_STEP + tl.where(reads, gap, 0.0)) / c.SPAN
-    elif c.FIELD:
+    elif c.flow:
         active = node > -1
         span = tl.where(k < node, gap / node, 0.0)
         fraction = tl.minimum((k + 1) / node, 1.0)
@@ -183,8 +183,8 @@ def drift(
     span, active, fraction, k, c: tl.constexpr,
 ):  # fmt: skip
     """Decay of h and trend of x over a step, from a table of states to another, or to itself."""
-    for n0 in range(0, c.H, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.H, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         m = n < c.H
         h = tl.load(source + c.X + n, mask=m, other=0.0)
         if c.DECAY:
@@ -198,8 +198,8 @@ def drift(
             after = tl.where(active[:, None], tl.maximum(before, clip(reached)), before)
             tl.store(applied_out + n, after, mask=m)
         tl.store(target + c.X + n, h, mask=m)
-    for n0 in range(0, c.A, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.A, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         m = n < c.A
         x = tl.load(source + n, mask=m, other=0.0)
         if c.TREND:
@@ -252,10 +252,10 @@ def stages(y, acts, slopes, w, layers, tab, bounds, span, KEEP: tl.constexpr, c:
     """Evaluates the vector field at each stage of a step; a stage has a row of activations."""
     for j in range(0, c.STAGES):
         own = j * c.BM * c.E
-        for n0 in range(0, c.D, c.BN):
-            n = n0 + tl.arange(0, c.BN)[None, :]
+        for n0 in range(0, c.D, c.BE):
+            n = n0 + tl.arange(0, c.BE)[None, :]
             m = n < c.D
-            total = tl.zeros((c.BM, c.BN), tl.float32)
+            total = tl.zeros((c.BM, c.BE), tl.float32)
             for q in range(0, j):
                 slope = tl.load(acts + q * c.BM * c.E + c.last + n, mask=m, other=0.0)
                 total += tl.load(tab + 4 * j + q) * slope
@@ -272,7 +272,7 @@ def stages(y, acts, slopes, w, layers, tab, bounds, span, KEEP: tl.constexpr, c:
 def moved_by(y, acts, tab, bounds, span, n, c: tl.constexpr):
     """The state after a step for the units `n`, and its kind as of `stop`."""
     m = n < c.D
-    total = tl.zeros((c.BM, c.BN), tl.float32)
+    total = tl.zeros((c.BM, c.BE), tl.float32)
     for q in range(0, c.STAGES):
         slope = tl.load(acts + q * c.BM * c.E + c.last + n, mask=m, other=0.0)
         total += tl.load(tab + 16 + q) * slope
@@ -289,8 +289,8 @@ def moved_by(y, acts, tab, bounds, span, n, c: tl.constexpr):
 @triton.jit
 def combine(y, acts, tab, bounds, span, c: tl.constexpr):
     """Ends a step of the solver."""
-    for n0 in range(0, c.D, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.D, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         moved, _kind = moved_by(y, acts, tab, bounds, span, n, c)
         tl.store(y + n, moved, mask=n < c.D)
     tl.debug_barrier()
@@ -302,8 +302,8 @@ def combine(y, acts, tab, bounds, span, c: tl.constexpr):
 @triton.jit
 def innovate(y, innovation, values, mask, bounds, ok, c: tl.constexpr):
     """Stores the innovation of anchored channels, of the state in `y`."""
-    for n0 in range(0, c.A, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.A, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         m = n < c.A
         value = tl.load(values + n, mask=ok & m, other=0.0)
         x = tl.load(y + n, mask=m, other=0.0)
@@ -331,14 +331,14 @@ def corrected_gain(value, x, seen, gain, odds, low, high, c: tl.constexpr):
 @triton.jit
 def anchor(y, innovation, values, mask, level, slope, w, bounds, ok, c: tl.constexpr):
     """Anchored channels take the observed values, or move by gains."""
-    for n0 in range(0, c.A, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.A, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         m = n < c.A
         value = tl.load(values + n, mask=ok & m, other=0.0)
         seen = tl.load(mask + n, mask=ok & m, other=0.0)
         x = tl.load(y + n, mask=m, other=0.0)
         if c.TREND:
-            low = tl.zeros((1, c.BN), tl.float32)
+            low = tl.zeros((1, c.BE), tl.float32)
             high = low
             if c.BOUNDED:
                 low = tl.load(bounds + n, mask=m, other=0.0)
@@ -419,8 +419,8 @@ def gates(h, innovation, projected, gate, inner, w, ok, c: tl.constexpr):
 @triton.jit
 def act(h, memory, gate, update, c: tl.constexpr):
     """The new h and memory from activated gates, where `update` is 1."""
-    for n0 in range(0, c.H, c.BN):
-        n = n0 + tl.arange(0, c.BN)[None, :]
+    for n0 in range(0, c.H, c.BE):
+        n = n0 + tl.arange(0, c.BE)[None, :]
         m = n < c.H
         on = update[:, None]
         old = tl.load(h + n, mask=m, other=0.0)
