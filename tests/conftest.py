@@ -10,6 +10,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Without a screen MuJoCo tries GLFW first and dies; EGL renders on the CPU as well.
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Kernels run on CPU tensors. It must be set before Triton is imported, by whatever imports it.
+os.environ.setdefault("TRITON_INTERPRET", "1")
 
 import hypothesis
 import torch

@@ -1,11 +1,13 @@
 """The scan over time steps: one signature, and the backends that run it.
 
 The reference backend (PyTorch) defines what a scan does and runs any part on any device. The cpu
-backend (C++) runs the named parts faster. `offbeat.kernels.backends` chooses between them.
+backend (C++) and the triton backend (CUDA) run the named parts faster.
+`offbeat.kernels.backends` chooses between them.
 """
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from offbeat.kernels import cpu, reference
@@ -16,6 +18,7 @@ from offbeat.kernels.backends import (
     Choice,
     choose,
     register_backend,
+    selected,
     use,
 )
 from offbeat.kernels.spec import (
@@ -27,6 +30,7 @@ from offbeat.kernels.spec import (
     StepTable,
     TableSteps,
 )
+from offbeat.kernels.triton import backend as triton_backend
 
 __all__ = [
     "BACKENDS",
@@ -126,7 +130,37 @@ def _cpu_perceptron(
     return cpu.perceptron(layers, x, activation, variant)
 
 
+def _triton_supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | None:
+    if device.type == "cpu" and selected()[0] != "triton":
+        return "the state is on the CPU, where kernels are interpreted and only run if selected"
+    return triton_backend.supports(spec, dtype, device)
+
+
+def _triton_scan(
+    spec: ScanSpec,
+    parts: ScanParts,
+    inputs: StepInputs | TableSteps,
+    state: Tensor,
+    variant: str | None,
+) -> tuple[Tensor, Tensor] | None:
+    if triton_backend.unsupported(parts, inputs, state):
+        return None
+    if state.device.type != "cpu" and triton_backend.distrusted(spec, parts, inputs, state):
+        return None
+    return triton_backend.scan(spec, parts, inputs, state)
+
+
 register_backend(Backend(REFERENCE, lambda spec, dtype, device: None, _reference_scan))
+register_backend(
+    Backend(
+        "triton",
+        _triton_supports,
+        _triton_scan,
+        available=lambda: () if triton_backend.why_not() else ("triton",),
+        why_not=lambda: triton_backend.why_not(),
+        fix="install triton where a GPU is, or set TRITON_INTERPRET=1",
+    )
+)
 register_backend(
     Backend(
         "cpu",

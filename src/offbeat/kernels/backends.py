@@ -35,6 +35,7 @@ class Backend:
         available: variants that run here, best first; empty if the backend was not
             built. A backend without variants returns its own name.
         why_not: the reason if none is available.
+        fix: what makes it available.
         perceptron: (layers, x, activation, variant) to the outputs, or to None if the call
             cannot run; None for a backend without one.
         training: a context manager for training with this backend.
@@ -50,6 +51,7 @@ class Backend:
     variants: tuple[str, ...] = ()
     available: Callable[[], Sequence[str]] | None = None
     why_not: Callable[[], str] = str
+    fix: str = "install Offbeat where a C++ compiler is available"
     perceptron: Callable[[Layers, Tensor, str, str | None], Tensor | None] | None = None
     training: Callable[[], AbstractContextManager[None]] = nullcontext
     capturable: bool = True
@@ -114,10 +116,7 @@ def choose(
         InputError: the selected backend cannot run here.
     """
     device = device or torch.device("cpu")
-    name, where = _chosen.get(), "offbeat.kernels.use"
-    if name is None:
-        name, where = os.environ.get("OFFBEAT_SCAN", "auto"), "OFFBEAT_SCAN"
-    name = ALIASES.get(name, name)
+    name, where = selected()
     named = {variant: each for each in BACKENDS.values() for variant in each.variants}
     one_of("scan backend", name, ("auto", *BACKENDS, *named, *ALIASES))
     reference = BACKENDS[REFERENCE]
@@ -138,7 +137,7 @@ def choose(
     if not runnable:
         raise InputError(
             f"{where} asks for the scan backend {name!r}, but the backend {backend.name} was not "
-            f"built ({backend.why_not()}); install Offbeat where a C++ compiler is available"
+            f"built ({backend.why_not()}); {backend.fix}"
         )
     variant = name if name in named else runnable[0]
     if variant not in runnable:
@@ -149,6 +148,14 @@ def choose(
     if reason is not None:
         return Choice(reference, REFERENCE, f"{backend.name}: {reason}")
     return Choice(backend, variant, f"selected by {where}")
+
+
+def selected() -> tuple[str, str]:
+    """The name of the backend or variant that is asked for, or `auto`, and what asks for it."""
+    name, where = _chosen.get(), "offbeat.kernels.use"
+    if name is None:
+        name, where = os.environ.get("OFFBEAT_SCAN", "auto"), "OFFBEAT_SCAN"
+    return ALIASES.get(name, name), where
 
 
 def _why_not(

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any, cast
 
 import torch
@@ -23,7 +25,7 @@ from torch.nn.functional import linear, pad
 
 from offbeat.kernels import reference
 from offbeat.kernels.spec import (
-    TRACKED_NODES,
+    KnownSteps,
     ScanParts,
     ScanSpec,
     StepInputs,
@@ -36,6 +38,10 @@ from offbeat.ode import tableau
 MEMORY_LIMIT = 512 * 2**20
 """Bytes of activations and their gradients that a launch of the backward kernel stores; more rows
 are further launches. It does not change the gradients beyond rounding."""
+
+TRUSTED = 1e-2
+"""Largest difference from the reference backend, as a fraction of the largest entry, with which
+this backend is used on a GPU; TF32 alone has 1e-3."""
 
 
 def interpreted() -> bool:
@@ -94,11 +100,11 @@ def tiles(spec: ScanSpec, trajectories: int) -> tuple[int, int, int]:
     """
     widest = max(spec.hidden_size, spec.anchors, *spec.field, 16)
     across = min(128, 1 << (widest - 1).bit_length())
-    down = 16 if trajectories < 2048 else 32 if trajectories < 8192 else 64
-    return down, across, 32
+    down = 16 if trajectories < 2048 else 32
+    return down, max(across, 64), 16
 
 
-def unsupported(parts: ScanParts, inputs: StepInputs, state: Tensor) -> str | None:
+def unsupported(parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor) -> str | None:
     """None if this backend runs a scan of a supported spec, else the reason why not."""
     given = (*parts.tensors(), *inputs.known())
     if any(t.dtype != state.dtype or t.device != state.device for t in given):
@@ -114,6 +120,55 @@ def scan(
     """Propagates a batch of states over all steps; see `offbeat.kernels.scan`."""
     before, after = scan_stacked(spec, [parts], [inputs.gathered()], state[None])
     return before[0], after[0]
+
+
+_trusted: dict[tuple[ScanSpec, torch.device], str] = {}
+
+
+def distrusted(
+    spec: ScanSpec, parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor
+) -> str:
+    """The reason if results on this device differ from the reference backend's, else "".
+
+    The first scan of a spec on a GPU is computed by both, with gradients.
+    """
+    key = (spec, state.device)
+    if key not in _trusted:
+        _trusted[key] = ""
+        error = disagreement(spec, parts, inputs.gathered(), state)
+        if not error <= TRUSTED:
+            _trusted[key] = f"results on {state.device} differ by {error:.2g} from the reference"
+            warnings.warn(f"the triton backend is not used: {_trusted[key]}", stacklevel=2)
+    return _trusted[key]
+
+
+def disagreement(spec: ScanSpec, parts: ScanParts, inputs: StepInputs, state: Tensor) -> float:
+    """The largest difference from the reference backend in states and gradients.
+
+    As a fraction of the largest entry of each tensor.
+
+    Args:
+        spec: see `offbeat.kernels.scan`; so are the others.
+        parts: their gradients are not changed.
+        inputs: see there.
+        state: see there.
+    """
+    leaves = [t for t in parts.tensors() if t.requires_grad]
+    found = []
+    with torch.enable_grad():
+        start = state.detach().requires_grad_()
+        for backend in (scan, reference.scan):
+            before, after = backend(spec, parts, inputs, start)
+            loss = before.square().mean() + after.square().mean()
+            gradients = torch.autograd.grad(loss, [start, *leaves], allow_unused=True)
+            zero = [torch.zeros_like(t) for t in (start, *leaves)]
+            each = zip(gradients, zero, strict=True)
+            found.append(
+                [before.detach(), after.detach(), *(z if g is None else g for g, z in each)]
+            )
+    pairs = zip(*found, strict=True)
+    errors = [(a - b).abs().max() / b.abs().max().clamp_min(1e-20) for a, b in pairs]
+    return float(torch.stack(errors).max())
 
 
 def scan_stacked(
@@ -141,7 +196,8 @@ def scan_stacked(
     each = [_Operands.of(spec, one, rows) for one, rows in zip(parts, inputs, strict=True)]
     operands = each[0] if len(each) == 1 else _Operands.stacked(each)
     packed = torch.stack([_packed(shape, one, state) for one in parts])
-    plan = _Plan.of(spec, shape, operands, len(parts))
+    known = inputs[0].known_steps if len(inputs) == 1 else None
+    plan = _Plan.of(spec, shape, operands, len(parts), known)
     empty = state.new_zeros(1)
     gates, start, end = (
         empty if t is None else t.contiguous()
@@ -223,18 +279,30 @@ class _Operands:
             assert dynamics.low is not None
             assert dynamics.high is not None
             bounds = torch.stack([dynamics.low, dynamics.high])
-        gates = reference._gates(spec, parts, inputs)
-        given = (lanes, values, mask, inputs.level_gain, inputs.slope_gain, gates, start, end)
-        return cls(*(None if t is None else t[None] for t in given), bounds, reads[None])  # type: ignore[arg-type]
+        given = {
+            "lanes": lanes,
+            "values": values,
+            "mask": mask,
+            "level": inputs.level_gain,
+            "slope": inputs.slope_gain,
+            "gates": reference._gates(spec, parts, inputs),
+            "start": start,
+            "end": end,
+            "reads": reads,
+        }
+        each: dict[str, Any] = {n: None if t is None else t[None] for n, t in given.items()}
+        return cls(**each, bounds=bounds)
 
     @classmethod
     def stacked(cls, runs: Sequence[_Operands]) -> _Operands:
+        """The operands of several runs, of equal bounds."""
+
         def cat(name: str) -> Any:
             each = [getattr(run, name) for run in runs]
             return None if each[0] is None else torch.cat(each)
 
-        names = "lanes values mask level slope gates start end".split()
-        return cls(*(cat(name) for name in names), runs[0].bounds, cat("reads"))
+        names = ("lanes", "values", "mask", "level", "slope", "gates", "start", "end", "reads")
+        return cls(**{name: cat(name) for name in names}, bounds=runs[0].bounds)
 
 
 def _packed(shape: Shape, parts: ScanParts, like: Tensor) -> Tensor:
@@ -291,7 +359,14 @@ class _Plan:
     bounds: Tensor
 
     @classmethod
-    def of(cls, spec: ScanSpec, shape: Shape, operands: _Operands, runs: int) -> _Plan:
+    def of(
+        cls,
+        spec: ScanSpec,
+        shape: Shape,
+        operands: _Operands,
+        runs: int,
+        known: KnownSteps | None,
+    ) -> _Plan:
         lanes = operands.lanes
         _, batch, rows, _ = lanes.shape
         blocks = -(-batch // shape.BM)
@@ -302,6 +377,7 @@ class _Plan:
             padded = pad(each, (0, 0, 0, blocks * shape.BM - batch))
             return padded.view(runs, blocks, shape.BM, rows).amax(dim=(0, 2))
 
+        tracked: list[int]
         reads = torch.zeros(blocks, rows, device=device)
         if spec.nodes:
             whole = most(lanes[..., 4] - lanes[..., 3])
@@ -314,24 +390,15 @@ class _Plan:
             each = spec.steps_per_gap if spec.field else int(bool(spec.decay or spec.trend))
             whole = torch.full((blocks, rows), float(each), device=device)
         steps = torch.stack([whole, reads], dim=-1).to(torch.int32)
-        tracked = whole.clamp_max(TRACKED_NODES) if spec.nodes else whole
-        tracked = (tracked + reads).long()
-        if spec.nodes or spec.max_step is not None:
-            counts = tracked.t().tolist()  # the one time that the CPU waits for the device
-        else:
-            counts = [[int(spec.steps_per_gap)] * blocks] * rows
-        until = [0]
-        for row in counts:
-            until.append(until[-1] + sum(row))
-        flat = tracked.t().reshape(-1)
-        slots = (flat.cumsum(0) - flat).view(rows, blocks).t().contiguous()
-        scheme = tableau(spec.solver)
-        tab = torch.zeros(20)
-        if spec.field:
-            for j, row in enumerate(scheme.a):
-                tab[4 * j : 4 * j + j] = torch.tensor(row)
-            tab[16 : 16 + scheme.stages] = torch.tensor(scheme.b)
-        table = torch.tensor(shape.table() or [[0, 0, 0, 0]], dtype=torch.int32)
+        if spec.max_step is None:
+            tracked = [spec.steps_per_gap] * rows
+        elif spec.nodes and known is not None:
+            each_row = zip(known.whole, known.read, strict=True)
+            tracked = [min(n, shape.TRACKED) + read for n, read in each_row]
+        else:  # the CPU waits for the device
+            limit = shape.TRACKED if spec.nodes else torch.inf
+            tracked = (whole.clamp_max(limit) + reads).amax(dim=0).int().tolist()
+        slots, layers, tab = _constants(shape, spec.solver, tuple(tracked), blocks, device)
         bounds = operands.bounds
         if bounds is None:
             bounds = torch.zeros(1, device=device)
@@ -343,10 +410,10 @@ class _Plan:
             rows,
             steps,
             slots,
-            until,
-            1 + max((max(row) for row in counts), default=0),
-            table.to(device),
-            tab.to(device),
+            [0, *accumulate(blocks * n for n in tracked)],
+            1 + max(tracked, default=0),
+            layers,
+            tab,
             bounds.contiguous(),
         )
 
@@ -376,6 +443,24 @@ class _Plan:
         return found
 
 
+@lru_cache(maxsize=64)
+def _constants(
+    shape: Shape, solver: str, tracked: tuple[int, ...], blocks: int, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`slots`, `layers` and `tab` of a plan; copied to the device once."""
+    before = torch.tensor([0, *accumulate(tracked)][:-1])
+    each = torch.tensor(tracked)
+    slots = before * blocks + torch.arange(blocks)[:, None] * each
+    layers = torch.tensor(shape.table() or [[0, 0, 0, 0]], dtype=torch.int32)
+    tab = torch.zeros(20)
+    if shape.flow:
+        scheme = tableau(solver)
+        for j, row in enumerate(scheme.a):
+            tab[4 * j : 4 * j + j] = torch.tensor(row)
+        tab[16 : 16 + scheme.stages] = torch.tensor(scheme.b)
+    return slots.to(device), layers.to(device), tab.to(device)
+
+
 # --- the kernels ----------------------------------------------------------------------------------
 
 
@@ -386,8 +471,9 @@ def options(shape: Shape) -> dict[str, Any]:
         shape: of the scan.
     """
     return {
-        "num_warps": 8 if shape.BM * shape.BN > 2048 else 4,
-        "num_stages": 2,
+        "num_warps": 8,
+        "num_stages": 1,
+        "maxnreg": 255,  # else the assembler can aim at fewer, and spill
         "enable_fp_fusion": True,
     }
 
@@ -509,6 +595,7 @@ def _cell_gradient(
     if shape.BOUNDED:
         low, high = plan.bounds[:, : shape.A]
         value, x = torch.clamp(value, low, high), torch.clamp(x, low, high)
+    assert plan.operands.mask is not None
     innovation = (plan.operands.mask * (value - x)).reshape(runs, -1, shape.A)
     at = slice(shape.w_innovation, shape.w_innovation + shape.G * shape.A)
     to_packed[:, at] = (g @ innovation).reshape(runs, -1)

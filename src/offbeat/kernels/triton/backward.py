@@ -167,7 +167,7 @@ def anchor_backward(
 @triton.jit
 def evaluate_backward(acts, deltas, w, layers, bounds, c: tl.constexpr):
     """From the gradient of the derivative, at the end of `deltas`, to that of the stage."""
-    for q in range(0, c.layers):
+    for q in range(c.layers):
         layer = c.layers - 1 - q
         k_size = tl.load(layers + 4 * layer + 1)
         n_size = tl.load(layers + 4 * layer)
@@ -187,7 +187,9 @@ def evaluate_backward(acts, deltas, w, layers, bounds, c: tl.constexpr):
                 by = tl.where(inner[None, :], 1.0 - value * value, 1.0)
             if c.BOUNDED:
                 low = tl.load(bounds + n, mask=(n < n_size) & (inner == 0), other=0.0)[None, :]
-                high = tl.load(bounds + c.D + n, mask=(n < n_size) & (inner == 0), other=0.0)[None, :]
+                high = tl.load(bounds + c.D + n, mask=(n < n_size) & (inner == 0), other=0.0)[
+                    None, :
+                ]
                 within = inside(value, low, high)
                 by = tl.where(inner[None, :], by, within)
             tl.store(deltas + here, z * by, mask=m)
@@ -206,7 +208,7 @@ def stages_backward(
         tl.store(moved + n, tl.where(kind > 0, all_of_it, 0.0), mask=n < c.D)
         tl.store(g + n, tl.where(kind != 0, all_of_it, 0.0), mask=n < c.D)
     tl.debug_barrier()
-    for p in range(0, c.STAGES):
+    for p in range(c.STAGES):
         j = c.STAGES - 1 - p
         own = j * c.BM * c.E
         for n0 in range(0, c.D, c.BE):
@@ -222,7 +224,7 @@ def stages_backward(
     for n0 in range(0, c.D, c.BE):
         n = n0 + tl.arange(0, c.BE)[None, :]
         total = tl.load(g + n, mask=n < c.D, other=0.0)
-        for q in range(0, c.STAGES):
+        for q in range(c.STAGES):
             total += tl.load(deltas + q * c.BM * c.E + n, mask=n < c.D, other=0.0)
         tl.store(g + n, total, mask=n < c.D)
     tl.debug_barrier()
@@ -367,7 +369,7 @@ def scan_backward(
         tl.store(g + n, given, mask=n < c.S)
     tl.debug_barrier()
 
-    for down in range(0, stop_at - begin):
+    for down in range(stop_at - begin):
         i = stop_at - 1 - down
         row = one * rows + i
         gap = tl.load(lanes + row * 8, mask=there, other=0.0)
@@ -380,7 +382,7 @@ def scan_backward(
         whole = tl.load(steps + (block * rows + i) * 2)
         reads = tl.load(steps + (block * rows + i) * 2 + 1)
         count = whole + reads
-        untracked = tl.maximum(whole - 256, 0) if c.NODES else whole * 0
+        untracked = tl.maximum(whole - c.TRACKED, 0) if c.NODES else whole * 0
         aside = tl.minimum(untracked, 1)  # a place that the untracked steps share
         later = whole - (node - first)
 
@@ -442,10 +444,12 @@ def scan_backward(
                 n = n0 + tl.arange(0, c.BE)[None, :]
                 m = n < c.D
                 earlier = tl.load(after + (row - 1) * c.S + n, mask=ok & m & later_row, other=0.0)
-                zeroth = tl.load(state + one[:, None] * c.S + n, mask=ok & m & (later_row == 0), other=0.0)
+                zeroth = tl.load(
+                    state + one[:, None] * c.S + n, mask=ok & m & (later_row == 0), other=0.0
+                )
                 tl.store(y + n, earlier + zeroth, mask=m)
             tl.debug_barrier()
-            for k in range(0, count):
+            for k in range(count):
                 place = tl.maximum(k - untracked + aside, 0)
                 here = tape + place * c.BM * c.D
                 copy(y, here, c.D, c)
@@ -467,7 +471,7 @@ def scan_backward(
             if reads == 0:
                 add(to_node, g, c.S, ok, c)
         if c.DECAY or c.TREND or c.flow:
-            for q in range(0, count - untracked):
+            for q in range(count - untracked):
                 k = count - 1 - q
                 if c.NODES:
                     if (reads > 0) & (k == whole - 1):

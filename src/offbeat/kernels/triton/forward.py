@@ -75,7 +75,7 @@ def scan_forward(
         tl.store(y + n, first_state, mask=n < c.S)
     tl.debug_barrier()
 
-    for i in range(0, rows):
+    for i in range(rows):
         row = one * rows + i
         there = at < batch
         gap = tl.load(lanes + row * 8, mask=there, other=0.0)
@@ -87,7 +87,7 @@ def scan_forward(
         row = row[:, None]
         whole = tl.load(steps + (block * rows + i) * 2)
         reads = tl.load(steps + (block * rows + i) * 2 + 1)
-        for k in range(0, whole + reads):
+        for k in range(whole + reads):
             if c.NODES:
                 if k == whole:
                     copy(y, node_state, c.S, c)

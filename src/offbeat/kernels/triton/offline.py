@@ -8,10 +8,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import subprocess
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +36,7 @@ class Compiled:
         arch: compute capability times ten.
         shared: bytes of shared memory of a program.
         registers: of a thread.
-        spilled: bytes of a thread that do not fit into registers.
-        stack: bytes of a thread's stack.
+        spilled: bytes of a thread that do not fit into registers: its stack, and local memory.
         code: bytes of the machine code.
     """
 
@@ -44,7 +45,6 @@ class Compiled:
     shared: int
     registers: int
     spilled: int
-    stack: int
     code: int
 
 
@@ -92,8 +92,7 @@ def compiled(kernel: str, shape: Shape, arch: int) -> Compiled:
         arch,
         found.metadata.shared,
         usage["REG"],
-        usage["LOCAL"],
-        usage["STACK"],
+        usage["LOCAL"] + usage["STACK"],
         len(found.asm["cubin"]),
     )
 
@@ -140,29 +139,35 @@ def example(hidden: int, *, anchored: bool = True) -> ScanSpec:
 
 
 def main() -> None:
-    """Compiles all shapes of `benchmarks/gpu.py` and prints a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Compiles the shapes of `benchmarks/gpu.py` and prints a line for each."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
     parser.add_argument("--arch", type=int, nargs="+", default=[80, 90])
     parser.add_argument("--hidden", type=int, nargs="+", default=[15, 64, 256])
     parser.add_argument("--batch", type=int, nargs="+", default=[50, 512, 4096])
     parser.add_argument("--precision", nargs="+", default=["ieee", "tf32"])
+    parser.add_argument("--anchored", nargs="+", default=["yes", "no"], choices=["yes", "no"])
+    parser.add_argument("--kernel", nargs="+", default=["forward", "backward"])
+    parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    print("kernel    arch precision hidden batch tiles          shared  registers spilled   code")
-    for arch in given.arch:
-        for precision in given.precision:
-            for hidden in given.hidden:
-                for batch in given.batch:
-                    for anchored in (True, False):
-                        spec = example(hidden, anchored=anchored)
-                        shape = Shape.of(spec, tiles(spec, batch), precision)
-                        for kernel in ("forward", "backward"):
-                            one = compiled(kernel, shape, arch)
-                            print(
-                                f"{kernel:9} {arch:4} {precision:9} {hidden:6} {batch:5} "
-                                f"{shape.BM:3} x{shape.BN:4} x{shape.BK:3} {one.shared:8} "
-                                f"{one.registers:8} {one.spilled:8} {one.code:8}",
-                                flush=True,
-                            )
+    if not given.json:
+        print(
+            "kernel   arch precision hidden batch anchored tiles         shared registers spilled"
+            "    code"
+        )
+    chosen = product(given.arch, given.precision, given.hidden, given.batch, given.anchored)
+    for (arch, precision, hidden, batch, anchored), kernel in product(chosen, given.kernel):
+        spec = example(hidden, anchored=anchored == "yes")
+        shape = Shape.of(spec, tiles(spec, batch), precision)
+        one = compiled(kernel, shape, arch)
+        if given.json:
+            print(json.dumps(asdict(one)), flush=True)
+            continue
+        print(
+            f"{kernel:8} {arch:4} {precision:9} {hidden:6} {batch:5} {anchored:8} "
+            f"{shape.BM:2} x{shape.BN:4} x{shape.BK:3} {one.shared:8} {one.registers:9} "
+            f"{one.spilled:7} {one.code:7}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

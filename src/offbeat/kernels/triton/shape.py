@@ -1,11 +1,11 @@
-"""The shape of a scan as the kernels see it: sizes, offsets and choices, fixed when they compile."""
+"""The shape of a scan as the kernels see it: sizes, offsets and choices; fixed at compilation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
 
-from offbeat.kernels.spec import ScanSpec
+from offbeat.kernels.spec import TRACKED_NODES, ScanSpec
 from offbeat.ode import tableau
 
 MOST_STAGES = 4
@@ -45,6 +45,7 @@ class Shape:
         BK: units that a product sums at once.
         BE: units of a tile of all else.
         PRECISION: of products, `ieee`, `tf32` or `tf32x3`.
+        TRACKED: steps from node to node before a row that have a gradient.
     """
 
     A: int
@@ -69,6 +70,7 @@ class Shape:
     BK: int
     BE: int
     PRECISION: str
+    TRACKED: int
 
     @classmethod
     def of(
@@ -105,6 +107,7 @@ class Shape:
             BK=tiles[2],
             BE=min(tiles[1], 32),
             PRECISION=precision,
+            TRACKED=TRACKED_NODES,
         )
 
     # --- units ------------------------------------------------------------------------------------
