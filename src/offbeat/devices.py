@@ -29,6 +29,9 @@ GPU_RATE = 10e12
 LAUNCH_S = 2.5e-6
 """s, time of a small kernel within a CUDA graph, about."""
 
+LAYER_S = 1e-6
+"""s, time of a layer of a block of trajectories in the triton backend, about."""
+
 LAUNCHES_PER_STEP = 12
 """Kernels of the reference backend per evaluation of the vector field, and per update, about."""
 
@@ -83,9 +86,10 @@ def preferred(model: nn.Module | None = None, *, batch: int = 1) -> tuple[torch.
 
     The work of a row is the number of multiplications and additions of its products, forward and
     backward, for the whole batch. The CPU does it at `CPU_RATE` per core; a GPU at `GPU_RATE`,
-    and needs `LAUNCH_S` for each of the small kernels that one row takes after the other. So a GPU
-    gains from large batches and wide models. The rates are rough figures, which nobody has measured
-    for this purpose: where it matters, time both.
+    and needs `LAUNCH_S` for each of the small kernels that one row takes after the other, or in
+    the triton backend `LAYER_S` for each layer. So a GPU gains from large batches and wide models.
+    The rates are rough figures, which nobody has measured for this purpose: where it matters, time
+    both.
 
     Args:
         model: that is to be computed; a registered module takes a GPU wherever there is one.
@@ -126,7 +130,10 @@ def row_seconds(model: Model, batch: int, device: torch.device) -> float:
         cores = torch.get_num_threads()
         return work / (CPU_RATE * max(1, cores))
     compiled = choose(spec, model.dtype, device).backend.name != REFERENCE
-    launches = 1 if compiled else 3 * LAUNCHES_PER_STEP * (evaluations + 1)
+    if compiled:  # all rows are one launch, in which layer waits for layer
+        layers = max(len(spec.field) - 1, 0) * evaluations + 3
+        return 3 * layers * LAYER_S + work / GPU_RATE
+    launches = 3 * LAUNCHES_PER_STEP * (evaluations + 1)
     return launches * LAUNCH_S + work / GPU_RATE
 
 

@@ -88,7 +88,7 @@ def supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | 
 
 def precision() -> str:
     """Precision of products: `tf32` where PyTorch uses it, else `ieee`."""
-    return "tf32" if torch.backends.cuda.matmul.allow_tf32 else "ieee"
+    return "ieee" if torch.get_float32_matmul_precision() == "highest" else "tf32"
 
 
 def tiles(spec: ScanSpec, trajectories: int) -> tuple[int, int, int]:
@@ -106,6 +106,8 @@ def tiles(spec: ScanSpec, trajectories: int) -> tuple[int, int, int]:
 
 def unsupported(parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor) -> str | None:
     """None if this backend runs a scan of a supported spec, else the reason why not."""
+    if torch.is_autocast_enabled(state.device.type):
+        return "products are in another precision by autocast"
     given = (*parts.tensors(), *inputs.known())
     if any(t.dtype != state.dtype or t.device != state.device for t in given):
         return "trained parts, inputs and state differ in type or device"
