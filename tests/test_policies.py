@@ -139,6 +139,20 @@ def test_an_observation_that_is_late_is_placed_at_its_stamp():
     policy.reset()
     policy.act(0.0, [0.1, 0.2])
     assert np.array_equal(policy.act(0.3, [0.5, 0.6], now=0.4), expected)
+    policy.reset()
+    policy.act(0.0, [0.1, 0.2])
+    policy.act(0.35)  # before it arrives
+    assert np.array_equal(policy.act(0.3, [0.5, 0.6], now=0.4), expected)
+
+
+def test_a_model_of_fixed_steps_takes_a_row_per_call_at_the_time_of_the_action():
+    policy = small("gru", update_rows="every", time_input="none")
+    policy.act(0.0, [0.1, 0.2])
+    without = policy.act(0.2, [0.5, 0.6])
+    policy.reset()
+    policy.act(0.0, [0.1, 0.2])
+    policy.act(0.1)
+    assert not np.array_equal(policy.act(0.05, [0.5, 0.6], now=0.2), without)
 
 
 @pytest.mark.parametrize("loss", ["mse", "nll"])
@@ -242,7 +256,7 @@ def test_lerobots_form_is_act():
         (lambda p: p.act(1.0, {"hip": 1.0}), "unknown observation 'hip'"),
         (lambda p: p.act(np.nan), "t must be a finite time"),
         (lambda p: p.act(1.0, "now"), "observation must be numbers"),
-        (lambda p: (p.act(1.0), p.act(0.5)), "times must not decrease"),
+        (lambda p: (p.act(1.0, [0, 0]), p.act(0.5)), "times must not decrease"),
         (lambda p: p.act(1.0, [1.0, 1.0], now=0.5), "times must not decrease"),
         (lambda p: p.reset(0), "n must be a number of robots"),
         (lambda p: p.restore({}), "no state of a policy"),

@@ -18,7 +18,7 @@ from offbeat.errors import InputError
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_model
 from offbeat.models.elapsed import RecurrentState
-from offbeat.models.model import Model
+from offbeat.models.model import Model, depends_on_rows
 
 State = dict[str, NDArray[Any]]
 """The state of a policy, by the names of its parts."""
@@ -27,7 +27,9 @@ State = dict[str, NDArray[Any]]
 class Policy:
     """Chooses actions from observations at uneven times, with frames and sensors missing.
 
-    A policy sees no actions, not even its own: clones that do tend to repeat their last one.
+    A policy sees no actions, not even its own: clones that do tend to repeat their last one. Asking
+    for an action without an observation leaves no trace, except in a model that updates at every
+    row (`update_rows="every"`), which takes one row per call, at the time of the action.
 
     Args:
         model: from `fit_policy`, or any model with channels of the role `action`. One without a
@@ -66,12 +68,10 @@ class Policy:
         self.log: tuple[Any, ...] = ()
         """A record per epoch of its cloning; empty for a policy that was loaded."""
         self._seen, self._acts = np.flatnonzero(~acts), torch.from_numpy(np.flatnonzero(acts))
+        self._every_row = isinstance(model, Model) and (
+            depends_on_rows(model.config) or model.config.nodes == "rows"
+        )
         self.reset()
-
-    @property
-    def recurrent(self) -> bool:
-        """Whether the model has a recurrent state."""
-        return isinstance(self.model, Model)
 
     def reset(self, n: int | None = None) -> None:
         """Begins an episode.
@@ -83,7 +83,8 @@ class Policy:
         if n is not None and (isinstance(n, bool) or not isinstance(n, int) or n < 1):
             raise InputError(f"n must be a number of robots, got {n!r}")
         self.n = n
-        self._time = np.full(n or 1, -np.inf)
+        self._newest = np.full(n or 1, -np.inf)  # s, of the newest observation
+        self._asked = np.full(n or 1, -np.inf)  # s, of the newest action
         self._past: RecurrentState | Batch | None = None
         if isinstance(self.model, Model):
             self._past = self.model.empty_state(n or 1)
@@ -115,22 +116,24 @@ class Policy:
         count = self.n or 1
         values, seen = self._row(observation, mask)
         stamp = _times("t", t, count)
+        arrived: NDArray[np.bool_] = np.asarray(seen.any(axis=1))
         asked = stamp if now is None else _times("now", now, count)
-        stamp = np.where(seen.any(axis=1), stamp, asked)
-        if (stamp < self._time).any() or (asked < stamp).any():
+        stamp = np.where(arrived, stamp, asked)
+        if self._every_row:
+            arrived, stamp = np.ones_like(arrived), asked
+        if (stamp < self._newest).any() or (asked < stamp).any():
             raise InputError(
                 f"times must not decrease, got an observation of {stamp.tolist()} s and an action "
-                f"at {asked.tolist()} s after {self._time.tolist()} s; reset() begins an episode"
+                f"at {asked.tolist()} s after an observation of {self._newest.tolist()} s; "
+                "reset() begins an episode"
             )
-        times = stamp[:, None]
-        if (asked > stamp).any():  # a row in which nothing is observed
-            times = np.stack([stamp, asked], axis=1)
-            values = np.stack([values, np.zeros_like(values)], axis=1)
-            seen = np.stack([seen, np.zeros_like(seen)], axis=1)
-        else:
-            values, seen = values[:, None], seen[:, None]
-        chosen = self._forward(times, values, seen)
-        self._time = asked
+        chosen, past = self._forward(stamp, values, seen)
+        if arrived.any():  # a row in which nothing is observed leaves no trace
+            self._past = _chosen(arrived, past, self._past)
+        if (asked > stamp).any():
+            chosen, _ = self._forward(asked, np.zeros_like(values), np.zeros_like(seen))
+        self._newest = np.where(arrived, stamp, self._newest)
+        self._asked = asked
         return chosen if self.n is not None else chosen[0]
 
     def select_action(self, batch: Mapping[str, Any]) -> Tensor:
@@ -156,7 +159,8 @@ class Policy:
             self.reset(len(state))
         t = batch.get("timestamp")
         if t is None:
-            t = np.where(np.isfinite(self._time), self._time + self.model.statistics.median_gap, 0)
+            gap = self.model.statistics.median_gap
+            t = np.where(np.isfinite(self._asked), self._asked + gap, 0.0)
         mask = batch.get("observation.mask")
         if mask is not None:
             mask = np.broadcast_to(np.asarray(mask), state.shape)
@@ -165,7 +169,7 @@ class Policy:
 
     def state(self) -> State:
         """The state of the episode as plain arrays; `restore` goes on from it bit for bit."""
-        past, arrays = self._past, {"at": self._time.copy()}
+        past, arrays = self._past, {"newest": self._newest.copy(), "asked": self._asked.copy()}
         for field in fields(past) if past is not None else ():
             value = getattr(past, field.name)
             if isinstance(value, Tensor):
@@ -183,12 +187,12 @@ class Policy:
         Raises:
             InputError: it is of another model. The policy has not changed then.
         """
-        at = state.get("at")
-        if at is None or at.ndim != 1:
-            raise InputError("this is no state of a policy (it has no array 'at')")
+        newest, asked = state.get("newest"), state.get("asked")
+        if newest is None or asked is None or newest.ndim != 1:
+            raise InputError("this is no state of a policy (it has no array 'newest')")
         fresh = Policy(self.model, window=self.window)
-        fresh.reset(len(at) if self.n is not None or len(at) > 1 else None)
-        names = {k: v for k, v in state.items() if k not in ("at", "rows")}
+        fresh.reset(len(newest) if self.n is not None or len(newest) > 1 else None)
+        names = {k: v for k, v in state.items() if k not in ("newest", "asked", "rows")}
         if isinstance(fresh._past, RecurrentState):
             expected = {
                 f.name: getattr(fresh._past, f.name)
@@ -210,7 +214,7 @@ class Policy:
             self._past = Batch(**tensors, roles=self.model.roles)
         else:
             self._past = None
-        self.n, self._time = fresh.n, at.copy()
+        self.n, self._newest, self._asked = fresh.n, newest.copy(), asked.copy()
 
     def save(self, path: str | Path) -> None:
         """Writes the policy to a folder, atomically, as a checkpoint of its model.
@@ -265,44 +269,66 @@ class Policy:
 
     def _forward(
         self, times: NDArray[np.float64], values: NDArray[np.float64], seen: NDArray[np.bool_]
-    ) -> NDArray[np.float64]:
-        """(n, actions) at the last of some rows, which become the past."""
-        model, shape = self.model, (*values.shape[:2], self.model.channels)
-        scaler = model.scaler
+    ) -> tuple[NDArray[np.float64], RecurrentState | Batch]:
+        """(n, actions) at a row, and the past after it."""
+        model, shape = self.model, (len(times), self.model.channels)
+        scaler, acts = model.scaler, self._acts.numpy()
         scaled, mask = np.zeros(shape), np.zeros(shape, dtype=bool)
-        scaled[..., self._seen] = (values - scaler.shift[self._seen]) / scaler.scale[self._seen]
-        mask[..., self._seen] = seen
-        given = torch.from_numpy(np.where(mask, scaled, 0.0)).to(model.device, model.dtype)
-        observed = torch.from_numpy(mask).to(model.device)
-        valid = torch.ones(shape[:2], dtype=torch.bool, device=model.device)
-        row = Batch(
-            torch.from_numpy(times).to(model.device), given, observed, observed, valid, model.roles
-        )
+        scaled[:, self._seen] = (values - scaler.shift[self._seen]) / scaler.scale[self._seen]
+        mask[:, self._seen] = seen
+        given = torch.from_numpy(np.where(mask, scaled, 0.0))[:, None].to(model.device, model.dtype)
+        observed = torch.from_numpy(mask)[:, None].to(model.device)
+        clock = torch.from_numpy(times)[:, None].to(model.device)
+        valid = torch.ones_like(clock, dtype=torch.bool)
+        row = Batch(clock, given, observed, observed, valid, model.roles)
+        past: RecurrentState | Batch
         with torch.inference_mode():
             if isinstance(model, Model):
                 assert isinstance(self._past, RecurrentState)
                 output = model(row, past=self._past)
-                # It sees no actions, so none are kept.
-                self._past = replace(output.past, actions=None)
+                past = replace(output.past, actions=None)  # it sees no actions, so none are kept
             else:
                 assert not isinstance(self._past, RecurrentState)
-                self._past = _joined(self._past, row, self.window)
-                output = model(self._past)
+                past = _joined(self._past, row, self.window)
+                output = model(past)
             chosen = output.mean[:, -1].double().cpu().index_select(1, self._acts).numpy()
-        acts = self._acts.numpy()
         chosen = chosen * scaler.scale[acts] + scaler.shift[acts]
-        return np.asarray(np.clip(chosen, self.low, self.high))
+        return np.asarray(np.clip(chosen, self.low, self.high)), past
 
 
 def _joined(past: Batch | None, row: Batch, window: int) -> Batch:
-    """The newest rows of some and further ones."""
+    """The newest rows of some and a further one."""
     if past is None:
         return row
     parts: dict[str, Any] = {
         name: torch.cat([getattr(past, name), getattr(row, name)], dim=1)[:, -window:]
-        for name in ("times", "values", "mask", "known", "valid")
+        for name in _ROWS
     }
+    # A robot that observes nothing may be asked for a time after that of a later observation.
+    parts["times"] = parts["times"].cummax(dim=1).values
     return replace(row, **parts)
+
+
+_ROWS = ("times", "values", "mask", "known", "valid")
+
+
+def _chosen(
+    arrived: NDArray[np.bool_],
+    after: RecurrentState | Batch,
+    before: RecurrentState | Batch | None,
+) -> RecurrentState | Batch:
+    """The past after a row of the robots that observed something, and that before it of others."""
+    if arrived.all() or not isinstance(before, RecurrentState):
+        return after
+    where = torch.from_numpy(arrived)
+    parts: dict[str, Any] = {}
+    for field in fields(before):
+        new, old = getattr(after, field.name), getattr(before, field.name)
+        if isinstance(old, Tensor):
+            here = where.to(old.device).view(-1, *(1,) * (old.ndim - 1))
+            parts[field.name] = torch.where(here, new, old)
+    assert isinstance(after, RecurrentState)
+    return replace(after, **parts)
 
 
 def _times(name: str, value: ArrayLike, count: int) -> NDArray[np.float64]:
