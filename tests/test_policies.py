@@ -411,7 +411,7 @@ def test_a_small_cloning_beats_random_and_held_values_under_drops(held_model):
     common = {"bounds": ([-2.0], [2.0]), "progress": False}
     config = CloneConfig(epochs=100, window=40)
     policy = fit_policy(shown, "ode_rnn", drops=Drops(frames=0.9), config=config,
-                        field_units=(32, 32), decoder_units=(32,), **common)  # fmt: skip
+                        decoder_units=(32,), **common)  # fmt: skip
     # The rival is trained with the same drops: on complete observations it is weaker.
     held = fit_policy(shown, held_model, drops=Drops(frames=0.9), config=config, width=64, **common)
     test = {"episodes": 24, "seed": 7, "drop": 0.7}
@@ -422,6 +422,16 @@ def test_a_small_cloning_beats_random_and_held_values_under_drops(held_model):
     assert returns["random"] < -900
     assert returns["policy"] > 0.4 * returns["random"]
     assert returns["policy"] > returns["held"] + 30
+
+
+def test_the_python_of_the_policies_page_runs(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("gymnasium")
+    from test_readme import run_python
+
+    monkeypatch.chdir(tmp_path)
+    run_python("docs/policies.md", {}, quick=("epochs=100", "epochs=1"))
+    assert "% observed" in capsys.readouterr().out
+    assert Policy.load("policy").actions == ("action_0",)
 
 
 def test_a_rollout_is_the_environment_driven_by_hand():

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from typing import Any
 
+from offbeat.cli.clone import clone_command
 from offbeat.cli.compare import compare_command
 from offbeat.cli.demo import demo_command
 from offbeat.cli.doctor import doctor_command
@@ -27,6 +28,7 @@ from offbeat.cli.inspect import inspect_command
 from offbeat.cli.models import models_command
 from offbeat.cli.predict import predict_command
 from offbeat.cli.resample import resample_command
+from offbeat.cli.rollout import rollout_command
 from offbeat.cli.simulate import simulate_command
 from offbeat.cli.stream import stream_command
 from offbeat.cli.sweep import sweep_command
@@ -70,6 +72,8 @@ COMMANDS: dict[str, Any] = {
     "impute": impute_command,
     "forecast": forecast_command,
     "resample": resample_command,
+    "clone": clone_command,
+    "rollout": rollout_command,
     "demo": demo_command,
     "models": models_command,
     "doctor": doctor_command,

@@ -1,0 +1,80 @@
+"""`offbeat clone` and `offbeat rollout`."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import offbeat as ob
+from offbeat.cli.app import main
+
+CLONE = ["--model=gru", "--epochs=2", "--window=20", "--json", "--quiet"]
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A table of 8 demonstrations: cosine, sine, speed and torque."""
+    path = tmp_path / "shown.csv"
+    lines = ["trajectory,time,cosine,sine,speed,torque"]
+    for i in range(8):
+        random = np.random.default_rng(i)
+        time = 0.0
+        for _ in range(30):
+            angle = np.sin(time + i)
+            row = [np.cos(angle), np.sin(angle), np.cos(time + i), np.clip(-3 * angle, -2, 2)]
+            lines.append(f"{i},{time:.6f}," + ",".join(f"{v:.6f}" for v in row))
+            time += random.uniform(0.02, 0.1)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_log_becomes_a_policy_that_acts_in_an_environment(log, tmp_path, capsys):
+    pytest.importorskip("gymnasium")
+    out = tmp_path / "policy"
+    named = ["--actions=[torque]", "--low=[-2]", "--high=[2]", "--reader.unwrap=false"]
+    assert main(["clone", str(log), str(out), *named, *CLONE]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["observations"] == ["cosine", "sine", "speed"]
+    assert said["actions"] == ["torque"]
+    assert said["demonstrations"] == 7
+    assert said["validation_mse"] > 0
+    policy = ob.Policy.load(out)
+    assert (policy.low, policy.high) == (-2, 2)
+    run = ["--episodes=2", "--steps=12", "--drop=0.7", "--json", "--quiet"]
+    assert main(["rollout", str(out), "Pendulum-v1", *run]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert len(said["returns"]) == 2
+    assert said["steps"] == [12, 12]
+    assert 0.1 < said["observed"] < 0.7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "demonstrations need observations and actions"),
+        (["--actions=[speed_limit]"], "unknown channel 'speed_limit'"),
+        (["--actions=[torque]", "--low=[-2]"], "give both, or neither"),
+        (["--actions=[torque]", "--loss=mae"], "unknown loss of actions 'mae'"),
+        (["--actions=[torque]", "--drop=1"], "frames must be a fraction"),
+        (["--actions=[torque]", "--validation=1"], "validation must be a fraction"),
+        (["--actions=[torque]", "--model=grub"], "unknown model 'grub'"),
+    ],
+)
+def test_a_wrong_option_ends_in_one_line(arguments, message, log, tmp_path, capsys):
+    assert main(["clone", str(log), str(tmp_path / "out"), *arguments, "--epochs=1"]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("offbeat: error: ")
+    assert message in error
+
+
+def test_a_folder_of_other_files_is_not_replaced(log, tmp_path, capsys):
+    assert main(["clone", str(log), str(tmp_path), "--actions=[torque]", "--epochs=1"]) == 2
+    assert "holds other files" in capsys.readouterr().err
+    assert log.exists()
+
+
+def test_a_folder_without_a_policy_is_refused(tmp_path, capsys):
+    assert main(["rollout", str(tmp_path), "Pendulum-v1"]) == 2
+    assert "is not a checkpoint" in capsys.readouterr().err
