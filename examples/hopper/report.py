@@ -119,7 +119,7 @@ def ablation(found: dict[str, Any]) -> str:
             [
                 PLANS[name].title,
                 *cells,
-                f"{100 * (error / first - 1):+.0f} %" if name != ABLATION[0] else "",
+                f"{round(100 * (error / first - 1)):+d} %" if name != ABLATION[0] else "",
                 _minutes(each),
                 f"{_size(each[0]):,}",
             ]
