@@ -33,7 +33,7 @@ def draw(found: dict[str, Any], path: Path) -> bool:
     own = found["own"]
     parts = [
         ("the large model", (0.006, 0.03), [n for n in PLANS if n in own and n not in ABLATION]),
-        ("changed in one thing", (0.013, 0.03), [n for n in ABLATION if n in own]),
+        ("changed in one thing", (0.01, 0.03), [n for n in ABLATION if n in own]),
     ]
     parts = [part for part in parts if part[2]]
     if not parts:
