@@ -1,23 +1,28 @@
-import csv
 import json
-import multiprocessing
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from offbeat import demo
-from offbeat.demo import ANCHORED, run_demo
-from offbeat.errors import InputError, MissingExtraError, OffbeatError
-from offbeat.models.zoo import THESIS_MODELS
+import offbeat as ob
+from offbeat import examples
+from offbeat.answers.blend import fit_blend
+from offbeat.data import arm_log
+from offbeat.demo import hopper, run_demo
+from offbeat.errors import InputError, MissingExtraError
 from offbeat.plots import animation
-from offbeat.sweeps import side_by_side
-from offbeat.sweeps.engines.base import Ending
+from offbeat.plots.errors import by_elapsed, by_task
 
-TINY = {"n_trajectories": 40, "epochs": 1, "anchored_epochs": 2, "progress": False}
-PREDICTORS = {*THESIS_MODELS, ANCHORED, "last_value"}
+TINY = {
+    "log_s": 8.0,
+    "arm_epochs": 1,
+    "arm_tasks": 16,
+    "n_trajectories": 40,
+    "hopper_epochs": 2,
+    "n_new": 12,
+    "progress": False,
+}
 
 
 def grey(backend, request, answer):
@@ -36,7 +41,11 @@ def no_rendering(monkeypatch):
 def made(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(animation, "_render_with", grey)
-        return run_demo(tmp_path_factory.mktemp("demo") / "out", workers=1, **TINY)
+        # The numbers of tasks of a real log take most of the time.
+        patch.setattr(examples, "VALIDATION_TASKS", 12)
+        patch.setattr(examples, "REFERENCE_TASKS", 24)
+        patch.setitem(fit_blend.__kwdefaults__, "count", 24)
+        return run_demo(tmp_path_factory.mktemp("demo") / "out", **TINY)
 
 
 @pytest.fixture
@@ -45,82 +54,56 @@ def copy(made, tmp_path):
     return tmp_path / "out"
 
 
-def scores(folder):
-    with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
-        return {line["model"]: line for line in csv.DictReader(file)}
-
-
-def weights(folder):
-    paths = folder.glob("models/*/model/model.safetensors")
-    return {path.parent.parent.name: path.read_bytes() for path in paths}
-
-
-def without_seconds(folder):
-    return {
-        name: {k: v for k, v in line.items() if k != "training_seconds"}
-        for name, line in scores(folder).items()
-    }
-
-
-def test_every_predictor_has_a_line_of_results(made):
-    lines = scores(made.folder)
-    assert set(lines) == PREDICTORS
-    assert list(lines["gru"]) == [
-        "model",
-        "steps",
-        "epochs",
-        "training_seconds",
-        "after_first_observation_rmse",
-        "masked_rmse",
-        "after_first_row_rmse",
-        "published_rmse",
-        "under_trained",
-    ]
-    for name, line in lines.items():
-        assert (
-            float(line["after_first_observation_rmse"])
-            == made.evaluation.scores[name].after_first_observation.rmse
-        )
-        assert float(line["published_rmse"]) == made.evaluation.scores[name].published.rmse
-        assert line["under_trained"] == ("false" if name == "last_value" else "true")
-    # 28 trajectories are one batch, so an epoch is a step.
-    assert {name: (line["steps"], line["epochs"]) for name, line in lines.items()} == {
-        **dict.fromkeys(THESIS_MODELS, ("1", "1")),
-        ANCHORED: ("2", "2"),
-        "last_value": ("0", "0"),
-    }
-
-
-def test_the_scores_are_also_written_as_json(made):
-    written = json.loads((made.folder / "results.json").read_text(encoding="utf-8"))
-    assert written == made.evaluation.to_dict()
-    assert written["scaler"] == "divide_by_max"
-    assert written["trajectories"] == 6
-
-
 def test_the_report_names_every_predictor_and_every_file(made):
     text = str(made)
-    lines = [line for line in text.splitlines() if line.split(" ")[0] in PREDICTORS]
-    assert len(lines) == len(PREDICTORS)
-    assert sum(" 1 of 7000 steps" in line for line in lines) == len(THESIS_MODELS)
-    assert sum(" 2 of 2100 steps" in line for line in lines) == 1
     assert set(made.written) == {path.name for path in made.folder.iterdir()}
     assert all(name in text for name in made.written)
+    shown = [*made.hopper.overall, "Blend", "Anchored trend alone", "PCHIP"]
+    assert all(name in text for name in shown)
+    assert "hopper-anchored-large" in shown
+    for path in made.folder.glob("*.png"):
+        with Image.open(path) as picture:
+            assert picture.width == 1400
 
 
 def test_a_machine_can_read_the_result(made):
     result = json.loads(json.dumps(made.to_dict(), allow_nan=False))
-    assert result["predictors"] == made.evaluation.to_dict()["predictors"]
-    assert result["training"]["gru"]["steps"] == 1
-    assert result["training"]["gru"]["under_trained"] is True
-    assert "hopper.gif" in result["written"]
+    written = json.loads((made.folder / "results.json").read_text(encoding="utf-8"))
+    assert result["hopper"] == written["hopper"]
+    assert [task["task"] for task in written["arm"]["tasks"]] == [
+        "fill dropouts",
+        "forecast, 0.1 s",
+        "forecast, 0.5 s",
+    ]
 
 
-def test_a_model_trained_to_the_end_is_not_marked():
-    history = (SimpleNamespace(steps=7000, seconds=60.0),)
-    training = demo.Training(history, 7000)
-    assert not training.under_trained
-    assert training.note() == "7000 of 7000 steps, 60 s"
+def test_errors_of_the_hopper_are_those_that_evaluate_gives(made):
+    name = "hopper-30-ode_rnn"
+    model = ob.load_model(f"offbeat/{name}")
+    recorded = ob.simulate("hopper", TINY["n_new"], rows=200, seed=hopper.NEW_SEED)
+    new = ob.mask_out(ob.windows(recorded, 100, seed=hopper.NEW_SEED), 0.3, seed=hopper.NEW_SEED)
+    scores = ob.evaluate(model, new).scores
+    for ours, theirs in ((name, model.name), ("last_value", "last_value")):
+        expected = scores[theirs].after_first_observation.rmse
+        assert made.hopper.overall[ours] == pytest.approx(expected, rel=1e-5)
+
+
+def test_hidden_values_are_those_that_a_log_without_dropouts_would_have():
+    options = {"seed": 1, "outage_s": 0.0}
+    whole = arm_log.with_hidden_values(10, **options)
+    times, table = arm_log.recorded(10, **options)
+    values = np.concatenate(list(table.values()), axis=1)
+    rows = np.searchsorted(whole.times, times)
+    np.testing.assert_array_equal(whole.times[rows], times)
+    seen = np.where(whole.observed, whole.values, np.nan)
+    np.testing.assert_array_equal(seen[rows], values)
+    hidden = np.isfinite(whole.values) & ~whole.observed
+    assert 0.03 < hidden.sum() / np.isfinite(whole.values).sum() < 0.07
+    clean = np.concatenate(list(arm_log.sensed(arm_log.motion(10, 1)).values()), axis=1)
+    position = np.interp(whole.times, arm_log.motion(10, 1).times, clean[:, 0])
+    error = whole.values[hidden[:, 0], 0] - position[hidden[:, 0]]
+    assert len(error) > 20
+    assert np.std(error) == pytest.approx(arm_log.NOISE["joints"][0], rel=0.5)
 
 
 def test_both_animations_show_every_row_and_the_second_hides_its_latter_half(made):
@@ -128,62 +111,35 @@ def test_both_animations_show_every_row_and_the_second_hides_its_latter_half(mad
     for name in ("hopper.gif", "hopper_extrapolation.gif"):
         with Image.open(made.folder / name) as gif:
             assert gif.n_frames == 100
-            line = np.asarray(gif.convert("RGB"), dtype=int)[-20, 380:]
+            line = np.asarray(gif.convert("RGB"), dtype=int)[
+                -20, 384:
+            ]  # the row before the middle is at 381
             blue.append((line[:, 2] - line[:, 0] > 100).sum())
     assert blue[0] > 10
     assert blue[1] == 0, "no row after the middle is observed"
 
 
-def test_a_second_run_trains_nothing_and_finds_the_same(made, copy):
-    logs = {path: path.read_bytes() for path in copy.glob("models/*/log.csv")}
-    again = run_demo(copy, workers=1, **TINY)
-    assert again.evaluation.to_dict() == made.evaluation.to_dict()
-    assert (copy / "results.csv").read_bytes() == (made.folder / "results.csv").read_bytes()
-    assert {path: path.read_bytes() for path in logs} == logs
-
-
-def test_a_demo_that_was_stopped_goes_on_where_it_was(made, copy):
-    shutil.rmtree(copy / "models" / "gru_d")
-    (copy / "results.csv").unlink()
-    shutil.rmtree(copy / "data")
-    run_demo(copy, workers=1, **TINY)
-    assert without_seconds(copy) == without_seconds(made.folder)
-
-
-@pytest.mark.slow
-def test_two_processes_train_the_same_models_as_one(made, tmp_path, capsys):
-    run_demo(tmp_path / "two", workers=2, **TINY)
-    assert weights(tmp_path / "two") == weights(made.folder)
-    assert without_seconds(tmp_path / "two") == without_seconds(made.folder)
-    assert capsys.readouterr().err == ""
-    assert multiprocessing.active_children() == []
-
-
-def test_an_error_in_a_process_that_trains_is_raised_here(copy):
-    (copy / "settings.json").unlink()  # so that only the runs in the folder can tell
-    with pytest.raises(InputError, match="holds another run"):
-        run_demo(copy, workers=2, **{**TINY, "n_trajectories": 41})
-    assert multiprocessing.active_children() == []
-
-
-def test_a_process_that_was_killed_is_reported_with_what_to_do():
-    lost = Ending(SimpleNamespace(name="gru"), lost=True)
-    with pytest.raises(OffbeatError, match="trained 'gru' was killed; run the same again"):
-        side_by_side.raise_failure(lost)
+def test_a_demo_that_was_stopped_goes_on_where_it_was_and_finds_the_same(made, tmp_path):
+    shutil.copytree(made.folder / "models", tmp_path / "models")
+    log = (tmp_path / "models/hopper/log.csv").read_bytes()
+    options = {k: TINY[k] for k in ("n_trajectories", "progress")}
+    trained, fitted = hopper.train_hopper(tmp_path, epochs=TINY["hopper_epochs"], seed=0, **options)
+    again = hopper.compare_hopper(tmp_path, trained, fitted, n_new=TINY["n_new"], progress=False)
+    assert again.overall == made.hopper.overall
+    assert (tmp_path / "models/hopper/log.csv").read_bytes() == log
 
 
 def test_other_settings_in_the_same_folder_change_nothing(copy):
     before = {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=r"seed \(0 then, 1 now\)"):
-        run_demo(copy, seed=1, workers=1, **TINY)
+        run_demo(copy, seed=1, **TINY)
     assert {path: path.read_bytes() for path in copy.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"workers": 0}, "workers must be at least 1, got 0"),
-        ({"epochs": 0}, "epochs must be an integer of at least 1, got 0"),
+        ({"hopper_epochs": 0}, "epochs must be an integer of at least 1, got 0"),
         ({"n_trajectories": 2}, "2 trajectories are too few"),
     ],
 )
@@ -200,15 +156,33 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     assert (tmp_path / "out").read_text(encoding="utf-8") == "mine"
 
 
-def test_where_nothing_renders_the_demo_says_so_and_writes_the_rest(copy, monkeypatch):
+def test_where_nothing_renders_the_demo_says_so(made, tmp_path, monkeypatch):
     def fail(*_, **__):
         raise MissingExtraError("MuJoCo cannot render here (egl: broken); install it")
 
-    for gif in copy.glob("*.gif"):
-        gif.unlink()
-    monkeypatch.setattr(demo, "side_by_side", fail)
-    result = run_demo(copy, workers=1, **TINY)
-    assert "egl: broken" in str(result)
-    assert not list(copy.glob("*.gif"))
-    assert not any(name.endswith(".gif") for name in result.written)
-    assert (copy / "predictions.png").exists()
+    monkeypatch.setattr(hopper, "side_by_side", fail)
+    model = ob.load_model(made.folder / "models/hopper/model")
+    log = ob.simulate("hopper", 1, rows=100, seed=0)[0]
+    (said,) = hopper._animate(tmp_path, model, log)
+    assert "egl: broken" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_figure_of_errors_has_a_line_per_task_and_refuses_what_it_cannot_draw():
+    figure = by_task({"fill": {"blend": 0.1, "pchip": 0.2}, "forecast": {"blend": 0.3}})
+    (axes,) = figure.axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["fill", "forecast"]
+    drawn = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
+    assert drawn == {"Blend": [[0.1, 0], [0.3, 1]], "PCHIP": [[0.2, 0]]}
+    with pytest.raises(InputError, match="above 0"):
+        by_task({"fill": {"blend": 0.0}})
+
+
+def test_labels_of_lines_that_end_together_do_not_cover_each_other():
+    ends = {"gru": [2.0, 1.0], "gru_d": [3.0, 1.001], "ode_rnn": [4.0, 10.0]}
+    (axes,) = by_elapsed([5, 10], ends).axes
+    heights = sorted(np.log(text.xy[1]) for text in axes.texts)
+    low, high = np.log(axes.get_ylim())
+    assert min(np.diff(heights)) > 0.05 * (high - low)
+    with pytest.raises(InputError, match="give 2 errors"):
+        by_elapsed([5, 10], {"gru": [1.0]})

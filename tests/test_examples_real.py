@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import norm
 
 import offbeat as ob
-from examples import arm_log
 from examples.real_logs import logs, predictors, report, results, scores, tasks
 from examples.real_logs.__main__ import main
 from offbeat.answers.scoring import score_one_step
 from offbeat.baselines import fit_baseline
+from offbeat.data import arm_log
 
 HORIZONS = ["forecast 0.1 s", "forecast 0.2 s", "forecast 0.5 s", "forecast 1 s"]
 

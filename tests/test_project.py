@@ -72,3 +72,48 @@ def test_every_module_begins_with_a_line_that_says_what_it_is_for():
         said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
         assert said, path
         assert said.splitlines()[0].endswith((".", ",", "?")), path
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory):
+    """Files of the source distribution, by their path in it, with their sizes."""
+    pyproject = pytest.importorskip("scikit_build_core.build")
+    import tarfile
+
+    folder = tmp_path_factory.mktemp("sdist")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        path = folder / pyproject.build_sdist(str(folder))
+    with tarfile.open(path) as archive:
+        return {m.name.partition("/")[2]: m.size for m in archive.getmembers() if m.isfile()}
+
+
+def test_the_source_distribution_has_all_that_its_build_and_the_package_need(sdist):
+    source = [
+        path.relative_to(ROOT).as_posix()
+        for folder in ("csrc", "src/offbeat")
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and path.suffix not in (".so", ".pyc")
+    ]
+    needed = ["pyproject.toml", "CMakeLists.txt", "README.md", "LICENSE", "PKG-INFO", *source]
+    assert [name for name in needed if name not in sdist] == []
+    assert any(name.endswith("mjcf/hopper.xml") for name in sdist)
+    assert any(name.endswith("model.safetensors") for name in sdist)
+
+
+def test_the_source_distribution_has_nothing_that_was_built_and_stays_small(sdist):
+    stray = [name for name in sdist if name.endswith((".so", ".pyc", ".o")) or "/runs/" in name]
+    assert stray == []
+    assert {name.partition("/")[0] for name in sdist if "/" in name} == {"csrc", "src"}
+    assert sum(sdist.values()) < 10e6
+    trained = [size for name, size in sdist.items() if name.startswith("src/offbeat/trained/")]
+    assert 1e6 < sum(trained) < 5e6
+
+
+def test_the_citation_names_the_thesis_and_the_papers_of_the_models():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    known = {str(each.get("notes", "")).split(".")[0] for each in citation["references"]}
+    assert {"GRU-D", "Neural ODE and its adjoint", "ODE-RNN and RNN-Decay"} <= known
+    titles = [each["title"] for each in citation["references"]]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8").replace("\n", " ")
+    assert titles[0] in readme

@@ -322,7 +322,7 @@ def arm(quick: bool) -> Log:
     240 s of joints at 100 Hz, an inertial unit at 200 Hz and a gripper at 20 Hz, with dropouts and
     an outage of 4 s. The first 70 % train, 15 % validate, 15 % test, in windows of 4 s.
     """
-    from examples import arm_log
+    from offbeat.data import arm_log
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "arm.csv"

@@ -54,7 +54,7 @@ From simulation to a scored model:
   offbeat impute runs/hopper hopper.parquet filled.csv
   offbeat forecast runs/hopper hopper.parquet ahead.csv --horizons 0.05,0.1
 
-To compare several models: offbeat demo"""
+To see it at work in two minutes: offbeat demo"""
 
 
 # The functions are not named after the commands: jsonargparse would find their namesakes in the

@@ -8,11 +8,11 @@ from offbeat.cli.common import say
 
 
 def demo_command(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:
-    """Run every step once, small: simulate, mask rows, train five models, score, plot.
+    """Fill the dropouts of an arm and predict a hopper, with models trained here and shipped ones.
 
     Args:
-        out: folder for the table, the figures, the animations and the trained models.
-        seed: of windows, masks, split, weights and batches.
+        out: folder for the scores, the figures, the animations and the trained models.
+        seed: of windows, masks, splits, weights, batches and tasks.
         json: print the scores as JSON.
     """
     from offbeat.demo import run_demo
