@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from .registry import PEERS, Options
-
-LOG_NAMES = ("g1", "lasa", "wrist", "hopper")
+from .table import LOGS as LOG_NAMES
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

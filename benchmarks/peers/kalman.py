@@ -15,6 +15,9 @@ from .registry import Options
 NOISE = 0.01
 """Standard deviation of the measurements of a smoother, scaled."""
 
+ROWS = 52_000
+"""Of all groups of channels together, to choose the noise on: about a minute."""
+
 MISSING = 1e9
 """Variance of a missing measurement: pykalman drops a row of which one value is masked."""
 
@@ -34,12 +37,13 @@ def smoother(problem: Problem, options: Options) -> Answerer:
     """
     paired = {i for pair in problem.pairs for i in pair}
     groups = [*problem.pairs, *((i,) for i in range(len(problem.channels)) if i not in paired)]
-    windows = problem.held_out[:: max(1, len(problem.held_out) // 6)]
+    count = ROWS // (len(groups) * len(problem.held_out[0].times))
+    windows = problem.held_out[:: max(1, len(problem.held_out) // max(count, 1))]
     settings = []
     for group in groups:
         best: tuple[Any, ...] = (np.inf,)
         for order in (2, 3):
-            for strength in 10.0 ** np.arange(-1, 9):
+            for strength in 10.0 ** np.arange(0, 9, 1.5):
                 error, z = _validate(problem, windows, group, order, strength)
                 best = min(best, (error, order, strength, z), key=lambda found: found[0])
         settings.append((group, *best[1:]))

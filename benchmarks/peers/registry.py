@@ -119,6 +119,15 @@ PEERS: Mapping[str, Peer] = {
         "forecasts from the last 10 rows of all channels, fills from slopes at both ends and the "
         "other channels; penalty chosen on validation",
     ),
+    "kernel_ridge": Peer(
+        "scikit-learn kernel ridge",
+        "sklearn_peers:kernel_ridge",
+        ("scikit-learn",),
+        (FORECAST,),
+        False,
+        "the features of the ridge and 300 Gaussian kernels of them (Nystroem), about 5,000 rows; "
+        "width and penalty chosen on validation",
+    ),
     "darts": Peer(
         "darts, ridge on 10 lags",
         "forecasters:darts",
@@ -136,14 +145,14 @@ PEERS: Mapping[str, Peer] = {
         "defaults, input of 2 horizons, quantile loss with an interval of 90 %; early stopping",
     ),
     **{
-        f"pypots_{name.lower()}": Peer(
-            f"PyPOTS {name}", f"pypots_peers:{name.lower()}", ("pypots", "torch"), (FILL,), True, s
+        f"pypots_{name}": Peer(
+            f"PyPOTS {title}", f"pypots_peers:{name}", ("pypots", "torch"), (FILL,), True, s
         )
-        for name, s in (
-            ("SAITS", f"2 layers, width 64, windows of 100 rows; {_MASKS}"),
-            ("BRITS", f"width 64, windows of 100 rows; {_MASKS}"),
-            ("GRUD", f"width 64, windows of 100 rows; {_MASKS}"),
-            ("ImputeFormer", f"2 layers, windows of 100 rows; {_MASKS}"),
+        for name, title, s in (
+            ("saits", "SAITS", f"2 layers, width 64, windows of 100 rows; {_MASKS}"),
+            ("brits", "BRITS", f"width 64, windows of 100 rows; {_MASKS}"),
+            ("grud", "GRU-D", f"width 64, windows of 100 rows; {_MASKS}"),
+            ("imputeformer", "ImputeFormer", f"2 layers, windows of 100 rows; {_MASKS}"),
         )
     },
     **{

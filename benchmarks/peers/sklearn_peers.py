@@ -20,6 +20,9 @@ LAGS = 10
 ALPHAS = (0.1, 1.0, 10.0, 100.0, 1000.0)
 """Penalties that are tried, of features in scaled units."""
 
+ALPHAS_OF_KERNELS = (0.01, 0.1, 1.0)
+"""The same, with kernels among the features."""
+
 
 def gaussian_process(problem: Problem, options: Options) -> Answerer:
     """A Gaussian process in time per channel, with a Matern 3/2 kernel and noise.
@@ -121,6 +124,48 @@ def ridge(problem: Problem, options: Options) -> Answerer:
     return lambda task, asked: (forecast if task.startswith("forecast") else fill)(asked)
 
 
+def kernel_ridge(problem: Problem, options: Options) -> Answerer:
+    """Ridge regression on the features of `ridge` and on Gaussian kernels of them, for forecasts.
+
+    Args:
+        problem: to answer.
+        options: seed of the points of the kernels.
+    """
+    from sklearn.kernel_approximation import Nystroem
+
+    channels, ahead = len(problem.channels), {}
+    for horizon in problem.horizons_s:
+        every = max(1, sum(len(s.times) for s in problem.train) // 5000)
+        x, y, ok = _pasts(problem, problem.train, horizon, every=every)
+        held = _pasts(problem, problem.validation, horizon, every=2)
+        tried = []
+        for gamma in (0.3, 3.0):
+            kernels = Nystroem(
+                gamma=gamma / x.shape[1], n_components=300, random_state=options.seed
+            )
+            mapped, held_mapped = kernels.fit_transform(x), kernels.transform(held[0])
+            both, held_both = np.hstack([x, mapped]), np.hstack([held[0], held_mapped])
+            models, errors = [], []
+            for c in range(channels):
+                inside = held[2][:, c]
+                part = (held_both[inside], held[1][inside, c])
+                models.append(_chosen([(both[ok[:, c]], y[ok[:, c], c]), part], ALPHAS_OF_KERNELS))
+                errors.append(np.mean((models[-1].predict(part[0]) - part[1]) ** 2))
+            tried.append((float(np.mean(errors)), kernels, models))
+        ahead[horizon] = min(tried, key=lambda each: each[0])[1:]
+
+    def one(series: Series) -> Answer:
+        past = problem.filled(series.values[:-1])
+        gap = series.times[-1] - series.times[-2]
+        kernels, models = ahead[min(ahead, key=lambda horizon: abs(horizon - gap))]
+        features = _features(past)[-1:]
+        both = np.hstack([features, kernels.transform(features)])
+        last = past[-1] + np.array([model.predict(both)[0] for model in models])
+        return Answer(np.tile(last * problem.scale + problem.mean, (len(series.times), 1)))
+
+    return lambda task, asked: [one(series) for series in asked]
+
+
 def _lines(problem: Problem, series: Series) -> Array:
     """(rows, channels) scaled, with lines between neighbours."""
     scaled = problem.scaled(series.values)
@@ -203,10 +248,10 @@ def _stacked(gaps: Sequence[tuple[Array, Array, Array, Any, int]]) -> tuple[Arra
     return x[np.isfinite(y)], y[np.isfinite(y)]
 
 
-def _chosen(parts: Sequence[tuple[Array, Array]]) -> Any:
+def _chosen(parts: Sequence[tuple[Array, Array]], alphas: Sequence[float] = ALPHAS) -> Any:
     """The regression of the penalty with the least error on the second part."""
     from sklearn.linear_model import Ridge
 
     (x, y), (held_x, held_y) = parts
-    tried = [Ridge(alpha=alpha, fit_intercept=False).fit(x, y) for alpha in ALPHAS]
+    tried = [Ridge(alpha=alpha, fit_intercept=False).fit(x, y) for alpha in alphas]
     return min(tried, key=lambda model: np.mean((model.predict(held_x) - held_y) ** 2))

@@ -10,6 +10,9 @@ from typing import Any
 
 from .registry import PEERS
 
+LOGS = ("g1", "lasa", "wrist", "hopper")
+"""In the order of the summary."""
+
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "benchmarks_peers.md"
 
 
@@ -23,7 +26,8 @@ def fill_in(text: str, out: Path) -> str:
 
     def found(match: re.Match[str]) -> str:
         name = match.group(1)
-        body = settings(out) if name == "settings" else rows(name, out)
+        whole = {"settings": settings, "summary": summary}
+        body = whole[name](out) if name in whole else rows(name, out)
         return f"<!-- {name} -->\n\n{body}\n\n<!-- end of {name} -->"
 
     return re.sub(r"<!-- (\w+) -->.*?<!-- end of \1 -->", found, text, flags=re.DOTALL)
@@ -46,12 +50,12 @@ def rows(log: str, out: Path) -> str:
     }
     head = ["", *tasks, "within 90 %: fill; forecasts", "fit, s", "answer, s", "MB", "lines"]
     lines = [_line(head), _line(["---"] * len(head))]
-    for result in found.values():
+    for name, result in found.items():
         if "error" in result:
             said = result["error"][:80]
-            lines.append(_line([result["title"], f"failed: {said}", *[""] * (len(head) - 2)]))
+            lines.append(_line([PEERS[name].title, f"failed: {said}", *[""] * (len(head) - 2)]))
             continue
-        cells = [result["title"]]
+        cells = [PEERS[name].title]
         for task in tasks:
             value = result["scores"][task]["rmse_scaled"] if _has(result, task) else None
             shown = "" if value is None else f"{value:.3g}"
@@ -59,6 +63,31 @@ def rows(log: str, out: Path) -> str:
         cells += [_coverage(result), f"{result['fit_cpu_s']:.3g}", f"{result['answer_cpu_s']:.3g}"]
         cells += [str(result["peak_mb"]), str(result["lines"])]
         lines.append(_line(cells))
+    return "\n".join(lines)
+
+
+def summary(out: Path) -> str:
+    """The table of Offbeat beside the best peer of each task.
+
+    Args:
+        out: folder of the results.
+    """
+    lines = [_line(["", "", "Offbeat", "best of the others", "which", "ratio"]), _line(["---"] * 6)]
+    for log in (log for log in LOGS if log in _logs(out)):
+        found = dict(results_of(log, out))
+        own = found.pop("offbeat", {}).get("scores", {})
+        for task, scores in own.items():
+            others = {
+                name: result["scores"][task]["rmse_scaled"]
+                for name, result in found.items()
+                if _has(result, task)
+            }
+            best = min(others, key=lambda name: others[name])
+            ours, theirs = scores["rmse_scaled"], others[best]
+            shown = [
+                f"**{v:.3g}**" if v == min(ours, theirs) else f"{v:.3g}" for v in (ours, theirs)
+            ]
+            lines.append(_line([log, task, *shown, PEERS[best].title, f"{ours / theirs:.2f}"]))
     return "\n".join(lines)
 
 
@@ -70,7 +99,7 @@ def settings(out: Path) -> str:
     """
     lines = [_line(["", "versions", "what was chosen", "command"]), _line(["---"] * 4)]
     for name, peer in PEERS.items():
-        logs = {log: results_of(log, out).get(name) for log in sorted(_logs(out))}
+        logs = {log: results_of(log, out).get(name) for log in LOGS}
         ran = [result for result in logs.values() if result and "versions" in result]
         if not ran:
             continue
