@@ -25,13 +25,16 @@ from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
 from offbeat.baselines.base import Array, Baseline, fit_baseline
-from offbeat.baselines.history import AgeBins, usual_gaps
+from offbeat.baselines.history import AgeBins, carried, usual_gaps
 from offbeat.baselines.members import fit_members
 from offbeat.baselines.stack import (
+    ACTIVITY,
+    LEVELS,
     arrays_of,
     independent_tasks,
     joined,
     members_of,
+    within,
 )
 from offbeat.baselines.weights import Errors, as_if_refitted, gate, simplex_weights, sources
 from offbeat.data.masking import masked_values
@@ -39,6 +42,9 @@ from offbeat.data.trajectory import Dataset, Trajectory
 
 EDGE = 0.15
 """Values with s (1 - s) below this are near the edge of their gap."""
+
+INTERVALS = 3
+"""Observed intervals on each side of a gap that say how much a channel moves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,34 +110,138 @@ class Sides:
         return np.where(both, inside, np.where(none, (forward + backward) / 2, alone))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class SideMotion:
+    """How much a channel moves around a gap, compared to how much it usually does.
+
+    Attributes:
+        gap: (channels,) s, usual gaps.
+        slope: (channels,) usual squared slope over `INTERVALS` observed intervals on each side.
+        rise: (bins, channels) usual squared difference of the observations around a gap.
+    """
+
+    gap: Array
+    slope: Array
+    rise: Array
+
+    @classmethod
+    def of(cls, tasks: Dataset, bins: AgeBins) -> SideMotion:
+        """The usual motion around the masked values of tasks.
+
+        Args:
+            tasks: of training.
+            bins: of lengths.
+        """
+        gap = usual_gaps(tasks)
+        slope, slopes = np.zeros(tasks.channels), np.zeros(tasks.channels)
+        rise, rises = np.zeros((len(bins), tasks.channels)), np.zeros((len(bins), tasks.channels))
+        for t in tasks:
+            masked, sides = masked_values(t), Sides.of(t)
+            near = _squared_slopes(t, gap)
+            counted = masked & np.isfinite(near)
+            slope += np.where(counted, near, 0.0).sum(axis=0)
+            slopes += counted.sum(axis=0)
+            row, channel = np.nonzero(masked & sides.before & sides.after)
+            at = bins.of_age(sides.length[row, channel]), channel
+            np.add.at(rise, at, _rises(t, sides)[row, channel] ** 2)
+            np.add.at(rises, at, 1.0)
+        return cls(
+            gap,
+            slope / np.maximum(slopes, 1),
+            carried(rise / np.maximum(rises, 1), rises),
+        )
+
+    def level(self, trajectory: Trajectory, sides: Sides, at: NDArray[np.int64]) -> Array:
+        """(rows, channels) 0 where a channel rests, up to `LEVELS` - 1 where it moves as usual.
+
+        Args:
+            trajectory: whose observed values are used.
+            sides: of the same.
+            at: (rows, channels) bins of the lengths.
+        """
+        channel = np.arange(trajectory.channels)
+        near = _squared_slopes(trajectory, self.gap)
+        near = np.where(np.isfinite(near), near, self.slope) / np.maximum(self.slope, 1e-300)
+        rise = _rises(trajectory, sides) ** 2 / np.maximum(self.rise[at, channel], 1e-300)
+        moved = np.maximum(near, np.where(sides.before & sides.after, rise, 0.0))
+        return np.asarray(sum(moved > 10.0**bound for bound in ACTIVITY))
+
+
+def _rises(trajectory: Trajectory, sides: Sides) -> Array:
+    channel = np.arange(trajectory.channels)
+    values = np.where(trajectory.observed, trajectory.values, 0.0)
+    return np.asarray(values[sides.later, channel] - values[sides.earlier, channel])
+
+
+def _squared_slopes(trajectory: Trajectory, gap: Array) -> Array:
+    """(rows, channels) mean squared slope of the observed intervals around; NaN without any.
+
+    Args:
+        trajectory: whose observed values are used.
+        gap: (channels,) s, below which intervals are taken as that long.
+    """
+    found = np.full(trajectory.values.shape, np.nan)
+    for c in range(trajectory.channels):
+        seen = np.flatnonzero(trajectory.observed[:, c])
+        if len(seen) < 2:
+            continue
+        steps = np.maximum(np.diff(trajectory.times[seen]), max(gap[c], 1e-12))
+        squares = (np.diff(trajectory.values[seen, c]) / steps) ** 2
+        total = np.append(0.0, np.cumsum(squares))
+        last = len(squares)
+        # The interval that a value is in counts for neither side.
+        before = np.searchsorted(seen, np.arange(trajectory.rows), side="right") - 1
+        start = np.clip(before - INTERVALS, 0, last), np.clip(before + 1, 0, last)
+        end = np.clip(before, 0, last), np.clip(before + 1 + INTERVALS, 0, last)
+        many = sum(e - s for s, e in zip(start, end, strict=True))
+        every = sum(total[e] - total[s] for s, e in zip(start, end, strict=True))
+        found[:, c] = np.where(many > 0, every / np.maximum(many, 1), np.nan)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
 class SideKeys:
-    """Kinds of values: length of the gap, near its edge or not; or outside, the time to it.
+    """Kinds of values: length of the gap, near its edge or not, or outside, the time to it; motion.
 
     Attributes:
         bins: of lengths.
+        motion: around the gap; None does not tell kinds of motion from one another.
     """
 
     bins: AgeBins
+    motion: SideMotion | None = None
+
+    @property
+    def levels(self) -> int:
+        """Kinds of motion."""
+        return 1 if self.motion is None else LEVELS
 
     def __len__(self) -> int:
-        return 4 * len(self.bins) + 1
+        return 4 * len(self.bins) * self.levels + 1
 
-    def of(self, sides: Sides) -> NDArray[np.int64]:
-        """(rows, channels) kinds."""
+    def of(self, trajectory: Trajectory) -> NDArray[np.int64]:
+        """(rows, channels) kinds of the values that are not observed.
+
+        Args:
+            trajectory: whose observed values are used.
+        """
+        sides = Sides.of(trajectory)
         at, many = self.bins.of_age(sides.length), len(self.bins)
         middle = sides.place * (1 - sides.place) >= EDGE
         key = np.where(middle, at + many, at)
         key = np.where(sides.before & ~sides.after, at + 2 * many, key)
         key = np.where(sides.after & ~sides.before, at + 3 * many, key)
-        return np.where(sides.before | sides.after, key, 4 * many).astype(np.int64)
+        if self.motion is not None:
+            key = key * self.levels + self.motion.level(trajectory, sides, at)
+        return np.where(sides.before | sides.after, key, len(self) - 1).astype(np.int64)
 
     @property
     def groups(self) -> NDArray[np.int64]:
         """(keys,) group of each kind: a length between observations, or one outside them."""
         many = len(self.bins)
         inside, outside = np.arange(many), many + np.arange(many)
-        return np.concatenate([inside, inside, outside, outside, [2 * many]])
+        every = np.concatenate([inside, inside, outside, outside])
+        return np.append(np.repeat(every, self.levels), 2 * many)
 
     def measured(self, usual: Array) -> NDArray[np.int64]:
         """(keys, channels) the kind of the least length of a channel in tasks, or a longer one.
@@ -142,18 +252,32 @@ class SideKeys:
         Args:
             usual: (channels,) s, gaps of the channels.
         """
-        many, own = len(self.bins), np.arange(len(self))[:, None]
-        at = np.append(np.tile(np.arange(many), 4), many)[:, None]
+        many = len(self.bins)
+        own, level = np.divmod(np.arange(len(self))[:, None], self.levels)
+        at = own % many
         gap, outside = self.bins.of_age(2 * usual), self.bins.of_age(usual)
         found = np.where(own >= 2 * many, own + np.maximum(outside - at, 0), own)
         middle = many + np.maximum(at, gap)
         found = np.where((own < many) & (at <= gap) | (own < 2 * many) & (at < gap), middle, found)
-        found[-1] = own[-1]
+        found = found * self.levels + level
+        found[-1] = len(self) - 1
         return np.asarray(found)
 
     def lengths(self) -> Array:
         """(keys,) s."""
-        return np.append(np.tile(self.bins.edges, 4), np.inf)
+        return np.append(np.repeat(np.tile(self.bins.edges, 4), self.levels), np.inf)
+
+    def arrays(self) -> dict[str, Array]:
+        """What is saved."""
+        motion = self.motion
+        kept = {} if motion is None else {n: getattr(motion, n) for n in ("gap", "slope", "rise")}
+        return {"edges": self.bins.edges, **{f"motion.{name}": a for name, a in kept.items()}}
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, Array]) -> SideKeys:
+        """The inverse of `arrays`; files of before have no motion."""
+        kept = within(arrays, "motion.")
+        return cls(AgeBins(arrays["edges"]), SideMotion(**kept) if kept else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +317,7 @@ class BothSides:
         channel = np.arange(dataset.channels)
         filled = []
         for i, trajectory in enumerate(dataset):
-            key = self.keys.of(Sides.of(trajectory))
+            key = self.keys.of(trajectory)
             weights = self.weights[key, channel]
             base = sum(weights[..., j] * predicted[i] for j, predicted in enumerate(every))
             values = np.asarray(base)
@@ -206,7 +330,7 @@ class BothSides:
         """What is saved."""
         return {
             **arrays_of(self.members),
-            "edges": self.keys.bins.edges,
+            **self.keys.arrays(),
             "weights": self.weights,
             "gamma": self.gamma,
             "widths": self.widths.table,
@@ -219,7 +343,7 @@ class BothSides:
         """The inverse of `arrays`."""
         return cls(
             members_of(arrays),
-            SideKeys(AgeBins(arrays["edges"])),
+            SideKeys.restored(arrays),
             arrays["weights"],
             arrays["gamma"],
             HalfWidths(arrays["widths"], arrays["widths_count"]),
@@ -266,7 +390,8 @@ def fit_both_sides(
     channels = train.tasks.channels
     lengths = longest_lengths(train.tasks)
     usual = float(np.quantile(lengths, 0.95)) if lengths else gap_s
-    keys = SideKeys(AgeBins.of_lengths(gap_s, usual, max(lengths, default=gap_s)))
+    bins = AgeBins.of_lengths(gap_s, usual, max(lengths, default=gap_s))
+    keys = SideKeys(bins, SideMotion.of(train.tasks, bins))
     found = fit_members(members, train.tasks, validation.tasks, budget_s=budget_s)
     fitted = {name: member.baseline for name, member in found.items()}
     predicted, later = [m.train for m in found.values()], [m.validation for m in found.values()]
@@ -345,7 +470,7 @@ def _errors(
     each: list[Array] = []
     for i, (trajectory, line) in enumerate(zip(tasks, reference.predict(tasks), strict=True)):
         row, channel = np.nonzero(masked_values(trajectory))
-        key = keys.of(Sides.of(trajectory))[row, channel]
+        key = keys.of(trajectory)[row, channel]
         unit, zero = units[key, channel], line[row, channel]
         columns["key"].append(key)
         columns["channel"].append(channel)
