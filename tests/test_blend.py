@@ -10,7 +10,7 @@ import pytest
 
 import offbeat as ob
 from offbeat.answers.blend import fit_blend, tables_of
-from offbeat.answers.both_sides import Sides
+from offbeat.answers.both_sides import SideMotion, Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
 from offbeat.baselines.history import AgeBins, carried
 from offbeat.baselines.stack import kinds_of
@@ -483,9 +483,10 @@ def test_a_kind_that_no_task_has_takes_the_next_that_one_has(two_rates):
     usual, twice = (int(b) for b in bins.of_age(np.array([0.1, 0.2])))
     assert usual < twice
     for table in (blend.both.weights, blend.both.widths.table):
+        of_kind = table[:-1].reshape(-1, blend.both.keys.levels, *table.shape[1:])
         for kind in (usual, twice, many + usual):
-            assert np.array_equal(table[kind, 1], table[many + twice, 1])
-        assert not np.array_equal(table[many + usual, 0], table[many + twice, 0])
+            assert np.array_equal(of_kind[kind, :, 1], of_kind[many + twice, :, 1])
+        assert not np.array_equal(of_kind[many + usual, :, 0], of_kind[many + twice, :, 0])
     ages = blend.stack.keys.bins.of_age(np.array([0.01, 0.1]))
     assert ages[0] < ages[1]
     for table in (blend.stack.weights, blend.widths.table):
@@ -498,3 +499,52 @@ def test_bins_without_values_take_those_of_a_neighbour():
     count = np.array([[0, 1], [1, 0], [0, 0], [2, 0]])
     found = [[3, 2], [3, 2], [3, 2], [7, 2]]
     assert carried(table, count).tolist() == found
+
+
+def test_motion_around_a_gap_is_that_of_its_neighbours_and_of_its_ends():
+    times = 0.1 * np.arange(40)
+    observed = np.ones((40, 3), dtype=bool)
+    observed[18:22] = False
+    walk = np.cumsum(np.where(np.arange(40) % 2, 1.0, -0.5))
+    values = np.stack([walk, 1e-3 * walk, np.where(np.arange(40) < 20, 0.0, 20.0)], axis=1)
+    one = ob.Trajectory(times, values, observed=observed)
+    sides = Sides.of(one)
+    # Usual: a squared slope of 62.5 (steps of 1 and -0.5 in 0.1 s), and ends that differ by 2.
+    motion = SideMotion(np.full(3, 0.1), np.full(3, 62.5), np.full((1, 3), 4.0))
+    level = motion.level(one, sides, np.zeros((40, 3), dtype=np.int64))
+    assert level[19].tolist() == [2, 0, 2], "moves, rests, rests on both sides of a move"
+    motion = replace(motion, slope=np.full(3, 620.0), rise=np.full((1, 3), 1e6))
+    level = motion.level(one, sides, np.zeros((40, 3), dtype=np.int64))
+    assert level[19].tolist() == [1, 0, 0], "a tenth of the usual squared slope"
+
+
+def test_a_channel_that_rests_is_filled_as_if_it_always_did():
+    """It moves in half of the tasks, where a smooth curve is far better than the line."""
+    random = np.random.default_rng(2)
+
+    def made(count: int) -> ob.Dataset:
+        logs = []
+        for i in range(count):
+            times = 0.01 * np.arange(400)
+            wave = np.sin(8 * times + random.uniform(0, 6)) if i % 2 else 0.0 * times
+            noise = random.normal(0, 1e-3, 400)
+            logs.append(ob.Trajectory(times, (wave + noise)[:, None], names=("x",)))
+        return ob.Dataset(tuple(logs))
+
+    task = TaskConfig(0.3, 0.01, 2.0)
+    options = {"causal": ("last_value",), "two_sided": ("linear", "pchip")}
+    blend = fit_blend(made(16), made(8), tasks=task, count=120, **options)
+    many, levels = len(blend.both.keys.bins), blend.both.keys.levels
+    linear = list(blend.both.members).index("linear")
+    longest = (2 * many - 1) * levels  # the middle of the longest gaps
+    rests, moves = (
+        blend.both.weights[longest, 0, linear],
+        blend.both.weights[longest + 2, 0, linear],
+    )
+    assert rests > 0.6 > 0.2 > moves
+    widths = blend.both.widths.table[:, 0, LEVELS.tolist().index(0.9)]
+    assert widths[longest] < 0.1 * widths[longest + 2]
+    again = tables_of(blend.arrays())["both"]
+    assert np.array_equal(again.keys.motion.rise, blend.both.keys.motion.rise)
+    before = {k: v for k, v in blend.arrays().items() if ".motion." not in k}
+    assert tables_of(before)["both"].keys.levels == 1, "a blend that was saved before"
