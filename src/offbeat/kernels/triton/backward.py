@@ -27,6 +27,7 @@ from offbeat.kernels.triton.steps import (
     step_of,
     stop,
     tanh,
+    zeros,
 )
 
 
@@ -92,7 +93,7 @@ def act_backward(h, memory, gate, inner, g, to_gate, to_inner, w, update, c: tl.
         for n0 in range(0, c.H, c.BN):
             n = n0 + tl.arange(0, c.BN)
             m = (n < c.H)[None, :]
-            to_h = tl.zeros((c.BM, c.BN), tl.float32)
+            to_h = zeros(c.BM, c.BN)
             weight = w + 2 * c.H * c.H
             if c.RESET_AFTER:
                 to_h = product(to_h, to_inner, weight, c.H, c.H, n, 1, c.H, c)
@@ -124,7 +125,7 @@ def anchor_backward(
     for n0 in range(0, c.A, c.BN):
         n = n0 + tl.arange(0, c.BN)
         m = (n < c.A)[None, :]
-        to_innovation = tl.zeros((c.BM, c.BN), tl.float32)
+        to_innovation = zeros(c.BM, c.BN)
         to_innovation = product(
             to_innovation, to_gate, w + c.w_innovation, c.G, c.A, n, 1, c.A, c
         )  # fmt: skip
@@ -132,7 +133,7 @@ def anchor_backward(
         seen = tl.load(mask + n, mask=ok & m, other=0.0)
         old = tl.load(x + n, mask=m, other=0.0)
         to_x = tl.load(g + n, mask=m, other=0.0)
-        low = tl.zeros((1, c.BN), tl.float32)
+        low = zeros(1, c.BN)
         high = low
         if c.BOUNDED:
             low = tl.load(bounds + n, mask=m, other=0.0)
@@ -176,7 +177,7 @@ def evaluate_backward(acts, deltas, w, layers, bounds, c: tl.constexpr):
         for n0 in range(0, n_size, c.BN):
             n = n0 + tl.arange(0, c.BN)
             m = (n < n_size)[None, :]
-            z = tl.zeros((c.BM, c.BN), tl.float32)
+            z = zeros(c.BM, c.BN)
             z = product(z, deltas + at + n_size, weight, k_size, n_size, n, 1, n_size, c)
             here = at + n[None, :]
             inner = n * 0 + layer > 0

@@ -38,6 +38,12 @@ def sigmoid(x):
 
 
 @triton.jit
+def zeros(rows: tl.constexpr, columns: tl.constexpr):
+    """Zeros; Triton before 3.8 takes lengths from a function's arguments, and not from a record."""
+    return tl.zeros((rows, columns), tl.float32)
+
+
+@triton.jit
 def clip(a):
     """An exponent within its bounds."""
     return tl.minimum(tl.maximum(a, 0.0), 30.0)
@@ -236,7 +242,7 @@ def evaluate(x, slopes, w, layers, KEEP: tl.constexpr, c: tl.constexpr):
             n = n0 + tl.arange(0, c.BN)
             m = (n < n_size)[None, :]
             bias = tl.load(weight + n_size * k_size + n, mask=n < n_size, other=0.0)
-            z = tl.zeros((c.BM, c.BN), tl.float32) + bias[None, :]
+            z = zeros(c.BM, c.BN) + bias[None, :]
             z = product(z, x + at, weight, k_size, 1, n, k_size, n_size, c)
             out = at + k_size + n[None, :]
             between = (n * 0 + layer < c.layers - 1)[None, :]
@@ -258,7 +264,7 @@ def stages(y, acts, slopes, w, layers, tab, bounds, span, KEEP: tl.constexpr, c:
         for n0 in range(0, c.D, c.BE):
             n = n0 + tl.arange(0, c.BE)[None, :]
             m = n < c.D
-            total = tl.zeros((c.BM, c.BE), tl.float32)
+            total = zeros(c.BM, c.BE)
             for q in range(j):
                 slope = tl.load(acts + q * c.BM * c.E + c.last + n, mask=m, other=0.0)
                 total += tl.load(tab + 4 * j + q) * slope
@@ -275,7 +281,7 @@ def stages(y, acts, slopes, w, layers, tab, bounds, span, KEEP: tl.constexpr, c:
 def moved_by(y, acts, tab, bounds, span, n, c: tl.constexpr):
     """The state after a step for the units `n`, and its kind as of `stop`."""
     m = n < c.D
-    total = tl.zeros((c.BM, c.BE), tl.float32)
+    total = zeros(c.BM, c.BE)
     for q in range(c.STAGES):
         slope = tl.load(acts + q * c.BM * c.E + c.last + n, mask=m, other=0.0)
         total += tl.load(tab + 16 + q) * slope
@@ -341,7 +347,7 @@ def anchor(y, innovation, values, mask, level, slope, w, bounds, ok, c: tl.const
         seen = tl.load(mask + n, mask=ok & m, other=0.0)
         x = tl.load(y + n, mask=m, other=0.0)
         if c.TREND:
-            low = tl.zeros((1, c.BE), tl.float32)
+            low = zeros(1, c.BE)
             high = low
             if c.BOUNDED:
                 low = tl.load(bounds + n, mask=m, other=0.0)
@@ -389,7 +395,7 @@ def gates(h, innovation, projected, gate, inner, w, ok, c: tl.constexpr):
             tl.store(gate + c.H + n[None, :], r, mask=m)
             if c.RESET_AFTER:
                 bias = tl.load(w + c.w_reset + n, mask=n < c.H, other=0.0)
-                z = tl.zeros((c.BM, c.BN), tl.float32) + bias[None, :]
+                z = zeros(c.BM, c.BN) + bias[None, :]
                 z = product(z, h, w + 2 * c.H * c.H, c.H, 1, n, c.H, c.H, c)
                 tl.store(inner + n[None, :], z, mask=m)
             else:
