@@ -100,7 +100,7 @@ def test_rows_of_several_launches_have_the_same_gradients(monkeypatch):
 
 
 def test_runs_of_one_launch_have_the_bits_that_each_has_alone():
-    cases = [small(seed=seed, flow="euler", decay="delta") for seed in (1, 2, 3)]
+    cases = [small(seed=seed, flow="euler", decay="delta") for seed in (1, 2)]
     alone = [run(backend.scan, case) for case in cases]
     leaves = [[*case.weights.tensors(), case.state] for case in cases]
     found = backend.scan_stacked(

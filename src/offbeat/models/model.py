@@ -315,6 +315,19 @@ class Model(BaseModel):
             fraction = float(self.config.self_feeding)
             prepared = replace(prepared, fed=_fed(generator, seen, prepared.rows, fraction))
         before, after = scan(self.spec, self.scan_parts(), prepared, state)
+        return self.decoded(prepared, state, before, after)
+
+    def decoded(
+        self, prepared: StepInputs | TableSteps, state: Tensor, before: Tensor, after: Tensor
+    ) -> Output:
+        """The prediction from the states of a scan.
+
+        Args:
+            prepared: step inputs of the scan.
+            state: (batch, state_size) before it.
+            before: (batch, rows, state_size) before the observation of each row.
+            after: (batch, rows, state_size) after each row.
+        """
         read = before
         if self.config.readout == "last_row":
             shifted = torch.cat([state, after.flatten(1)[:, : -self.spec.state_size]], dim=1)

@@ -99,9 +99,9 @@ def tiles(spec: ScanSpec, trajectories: int) -> tuple[int, int, int]:
         trajectories: of all runs.
     """
     widest = max(spec.hidden_size, spec.anchors, *spec.field, 16)
-    across = min(128, 1 << (widest - 1).bit_length())
     down = 16 if trajectories < 2048 else 32
-    return down, max(across, 64), 16
+    across = 1 << (widest - 1).bit_length()
+    return down, min(max(across, 64), 2048 // down), 16  # as many as fit into registers
 
 
 def unsupported(parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor) -> str | None:

@@ -105,7 +105,7 @@ class Shape:
             BM=tiles[0],
             BN=tiles[1],
             BK=tiles[2],
-            BE=min(tiles[1], 32),
+            BE=min(tiles[1], 512 // tiles[0]),
             PRECISION=precision,
             TRACKED=TRACKED_NODES,
         )
