@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Iterable
@@ -53,6 +54,7 @@ class Session:
         self.diverged: list[str] = []
         self.groups = {*record.groups(), here}
         self.session = _SessionFile(out, engine.description)
+        self._written_at, self._write_s, self._unwritten = -math.inf, 0.0, False
 
     def run(
         self, tasks: Iterable[Task], *, asked: Iterable[Run], deadline: float | None = None
@@ -96,6 +98,7 @@ class Session:
                 self.shown.say(f"the time is over; the next call resumes: {names}")
         finally:
             self.engine.stop()
+            self._write(now=True)
             self.running.clear()
             self._show(now=True)
             self.shown.close()
@@ -132,7 +135,8 @@ class Session:
                 "the same folder as this process"
             )
         self.record = self.record.with_run(row, task.curve()).in_order(self.order)
-        self.record.write(self.out)
+        self._unwritten = True
+        self._write()
         self.session.update(row["run_id"])
         group = self.record.group_of(row)
         if group not in self.groups:
@@ -147,6 +151,17 @@ class Session:
             f"[{self._done()}/{len(self.asked)}] {task.name}: test RMSE {rmse:.4f}, last value "
             f"{trivial:.4f}, {duration(row['seconds'])}; left: {duration(self._left())}"
         )
+
+    def _write(self, *, now: bool = False) -> None:
+        """Writes the record, in no more than about a tenth of the time: it grows with each run.
+
+        What is not written yet is in the folders of the runs, where the next call finds it.
+        """
+        began = time.monotonic()
+        if self._unwritten and (now or began - self._written_at >= 10 * self._write_s):
+            self.record.write(self.out)
+            self._written_at = time.monotonic()
+            self._write_s, self._unwritten = self._written_at - began, False
 
     def _done(self) -> int:
         return sum(run.run_id in self.record.runs for run in self.asked)
