@@ -15,7 +15,7 @@ import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.models.zoo import train_config
 from offbeat.sweeps.engines import local
-from offbeat.sweeps.engines.base import attempt
+from offbeat.sweeps.engines.base import Ending, Engine, attempt
 from offbeat.sweeps.fingerprint import random_walks
 from offbeat.sweeps.record import Record
 
@@ -191,3 +191,39 @@ def test_a_job_on_a_full_disk_fails_with_the_file_and_what_to_do():
         f"gru-0: runs/gru-0/log.csv can't be written: {os.strerror(errno.ENOSPC)}; free some "
         "space, then repeat the command"
     )
+
+
+class Here(Engine):
+    """Runs jobs in this process."""
+
+    capacity, description = 1, "this process"
+
+    def submit(self, job):
+        self.job = job
+
+    def wait(self, seconds):
+        return [Ending(self.job, attempt(self.job))]
+
+    def stop(self):
+        pass
+
+
+def test_a_record_whose_writing_takes_long_is_written_seldom_and_whole_at_the_end(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr("offbeat.sweeps.running.engine_named", lambda *_, **__: Here())
+    writes, write = [], Record.write
+
+    def slow(self, folder):
+        writes.append(len(self.runs))
+        time.sleep(0.3)
+        write(self, folder)
+
+    monkeypatch.setattr(Record, "write", slow)
+    model = {"gru": MODELS["gru"]}
+    found = ob.sweep(DATA, model, out=tmp_path, **{**OPTIONS, "epochs": 1, "repeats": 4})
+    assert writes[0] == 0
+    assert writes[-1] == 4
+    assert len(writes) < 6
+    assert Record.read(tmp_path).runs == found.record.runs
+    assert len(found.record.runs) == 4
