@@ -13,7 +13,8 @@ from offbeat.answers.blend import fit_blend, tables_of
 from offbeat.answers.both_sides import SideMotion, Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
 from offbeat.baselines.history import AgeBins, carried
-from offbeat.baselines.stack import kinds_of
+from offbeat.baselines.stack import LEVELS as MOTIONS
+from offbeat.baselines.stack import Stack, kinds_of
 from offbeat.baselines.weights import (
     Errors,
     as_if_refitted,
@@ -489,9 +490,44 @@ def test_a_kind_that_no_task_has_takes_the_next_that_one_has(two_rates):
         assert not np.array_equal(of_kind[many + usual, :, 0], of_kind[many + twice, :, 0])
     ages = blend.stack.keys.bins.of_age(np.array([0.01, 0.1]))
     assert ages[0] < ages[1]
+    short, own = (int(blend.stack.keys.usual[int(at)]) for at in ages)
     for table in (blend.stack.weights, blend.widths.table):
-        short, own = (table[3 * int(at) : 3 * int(at) + 3, 1] for at in ages)
-        assert np.array_equal(short, own)
+        for kind in (short, short + MOTIONS):
+            # The next measurement comes when the other sensor was seen in the meantime.
+            assert np.array_equal(table[kind, 1], table[own + MOTIONS, 1])
+
+
+def test_an_outage_of_one_sensor_is_another_kind_than_one_of_all():
+    """Position and velocity: a position that is out is found from its velocity, not so both."""
+    random = np.random.default_rng(3)
+    times = 0.02 * np.arange(300)
+    logs = []
+    for _ in range(10):
+        velocity = np.cumsum(random.normal(0, 1, 300)) * 0.2
+        velocity -= np.linspace(0, velocity[-1], 300)
+        position = np.cumsum(velocity) * 0.02
+        logs.append(ob.Trajectory(times, np.stack([position, velocity], 1), names=("x", "v")))
+    task = TaskConfig(0.6, 0.02, 4.0, (("x",), ("v",)))
+    parts = ob.Dataset(tuple(logs[:7])), ob.Dataset(tuple(logs[7:]))
+    blend = fit_blend(
+        *parts, tasks=task, causal=("last_value", "ridge"), two_sided=("linear",), count=150
+    )
+    usual = blend.stack.keys.usual[3:]
+    alone = blend.stack.weights[usual + MOTIONS, 0, 1]
+    assert (alone > 0.9).all()
+    widths = blend.widths.table
+    assert (widths[usual + MOTIONS, 0, 9] < widths[usual, 0, 9]).all()
+
+
+def test_kinds_of_before_outages_were_told_apart_are_read(blend):
+    old = dict(blend.stack.arrays())
+    kinds = len(blend.stack.keys.bins) * MOTIONS + 1
+    old["weights"] = old["weights"][:kinds]
+    keys = Stack().restore(old).keys
+    assert (keys.each, len(keys)) == (MOTIONS, kinds)
+    found, now = kinds_of(keys, waves(3, 1))[0], kinds_of(blend.stack.keys, waves(3, 1))[0]
+    assert np.array_equal(found[..., 1:], now[..., 1:])
+    assert found[..., 0].max() == kinds - 1
 
 
 def test_bins_without_values_take_those_of_a_neighbour():

@@ -33,7 +33,6 @@ from offbeat.baselines.history import typical_gap
 from offbeat.baselines.kalman_groups import MotionFilter
 from offbeat.baselines.simple import as_index, as_kind, channels_of
 from offbeat.baselines.stack import (
-    LEVELS,
     Stack,
     errors_of,
     fit_stack,
@@ -63,6 +62,9 @@ _SURE = 0.95
 
 TASKS = 800
 """Tasks that are drawn from the training data and from the validation data, at most."""
+
+FEWEST_TASKS = 400
+"""Tasks that are drawn of a short log too: regressions learn from where silences begin and end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +242,7 @@ class Blend:
         """
         edges = self.stack.keys.bins.edges
         lines = [["gamma: channel", *(f"to {edge:.3g} s" for edge in edges)]]
-        usual = self.gamma[LEVELS - 1 :: LEVELS][: len(edges)]
+        usual = self.gamma[self.stack.keys.usual]
         for c, name in enumerate(self.names):
             lines.append([name, *(f"{g:.2f}" for g in usual[:, c])])
         return plain(lines)
@@ -254,7 +256,7 @@ class Blend:
                 found.append(f"filtered together: {groups}")
         # A level needs as many independent values as make one miss likely.
         needed = 1 / (1 - _SURE)
-        counts = self.widths.count[LEVELS - 1 :: LEVELS]
+        counts = self.widths.count[self.stack.keys.usual]
         short = [
             (float(edge), int(count))
             for edge, count in zip(self.stack.keys.bins.edges, counts, strict=False)
@@ -425,7 +427,7 @@ def by_direction(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def number_of_tasks(part: Dataset, config: TaskConfig, most: int) -> int:
-    """Tasks that cover a part about four times, from 100 to `most`; fewer of very large ones.
+    """Tasks that cover a part about four times, from `FEWEST_TASKS` to `most`; fewer of large ones.
 
     Args:
         part: that they are drawn from.
@@ -435,7 +437,7 @@ def number_of_tasks(part: Dataset, config: TaskConfig, most: int) -> int:
     span = sum(float(t.times[-1] - t.times[0]) for t in part)
     rows = sum(t.rows for t in part)
     values = rows * part.channels * min(config.length_s / max(span, 1e-12), 1.0)
-    wanted = np.clip(4 * span / config.length_s, min(100, most), most)
+    wanted = np.clip(4 * span / config.length_s, min(FEWEST_TASKS, most), most)
     return int(max(min(wanted, LARGEST / max(values, 1.0)), min(30, most)))
 
 

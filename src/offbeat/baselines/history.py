@@ -14,6 +14,9 @@ from offbeat.data.trajectory import Dataset, Trajectory
 LONGEST_BIN = 24
 """Most bins of times since observation."""
 
+OTHERS = 0.55
+"""Others are still observed where the newest value is younger by this factor."""
+
 
 class History:
     """The last observations of every channel, newest first.
@@ -158,6 +161,19 @@ def _steps(t: Trajectory) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     channel, row = np.nonzero(t.observed.T)
     same = channel[1:] == channel[:-1]
     return channel[1:][same], np.diff(row)[same], np.diff(t.times[row])[same]
+
+
+def others_seen(age: Any) -> Any:
+    """Whether other channels were observed while one was not: its outage is not one of all.
+
+    Args:
+        age: (..., channels) s since the last observation of each channel.
+
+    Returns:
+        (..., channels) True where the newest observation of all channels is younger than `OTHERS`
+        of the age.
+    """
+    return namespace(age).amin(age, -1)[..., None] < OTHERS * age
 
 
 def usual_gaps(dataset: Dataset) -> Array:

@@ -16,15 +16,12 @@ from offbeat.baselines.base import (
 )
 from offbeat.baselines.examples import FURTHEST, Examples, examples_of, likeness, some_tasks
 from offbeat.baselines.held_out import held_out_ridge
-from offbeat.baselines.history import AgeBins, History, longest_age, typical_gap
+from offbeat.baselines.history import AgeBins, History, longest_age, others_seen, typical_gap
 from offbeat.baselines.simple import as_kind
 from offbeat.data.trajectory import Dataset
 
 SPANS = (1, 2, 4)
 """Intervals that the slopes span."""
-
-OTHERS = 0.55
-"""Others are still observed where the newest value is younger by this factor."""
 
 AVERAGES = 2
 """Exponential averages of each channel."""
@@ -186,8 +183,7 @@ class Ridge(CausalBaseline):
         age = xp.clip(age, 0.0, float(self.edges[-1]))
         at = bins.of_age(age)
         relative = age / as_kind(bins.middle, age)[at]
-        others = xp.amin(age, -1)[..., None] < OTHERS * age
-        at = xp.where(others, at + len(bins), at)
+        at = xp.where(others_seen(age), at + len(bins), at)
         return (
             xp.where(seen, at, 0 * at + 2 * len(bins)),
             xp.where(seen, relative, xp.ones_like(relative)),

@@ -20,7 +20,7 @@ from offbeat.baselines.base import (
     padded,
     stepped,
 )
-from offbeat.baselines.history import AgeBins, History, usual_gaps
+from offbeat.baselines.history import AgeBins, History, others_seen, usual_gaps
 from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.members import fit_members
 from offbeat.baselines.simple import as_index, as_kind, channels_of
@@ -77,20 +77,24 @@ def values_at(predicted: Sequence[Array], cells: Cells) -> Array:
 
 
 class Keys:
-    """Kinds of values: the bin of the time since observation, and the present motion.
+    """Kinds of values: the bin of the time since observation, others seen since, present motion.
 
-    A value whose channel was never observed before has a kind of its own, the last one.
+    Where other channels were observed in the meantime (`others_seen`), as while one sensor is out,
+    other predictors are right than where nothing was, as in a forecast: a velocity that is still
+    measured gives the position. A value whose channel was never observed before has a kind of its
+    own, the last one.
 
     Attributes:
         bins: of the time since observation.
         local: the present motion.
+        each: kinds per bin; half of them where blends of before this distinction are read.
     """
 
-    def __init__(self, bins: AgeBins, local: LocalScale) -> None:
-        self.bins, self.local = bins, local
+    def __init__(self, bins: AgeBins, local: LocalScale, each: int = 2 * LEVELS) -> None:
+        self.bins, self.local, self.each = bins, local, each
 
     def __len__(self) -> int:
-        return len(self.bins) * LEVELS + 1
+        return len(self.bins) * self.each + 1
 
     def start(self, like: Any) -> State:
         """See `CausalBaseline`."""
@@ -107,29 +111,43 @@ class Keys:
         level = 0.0 * square
         for bound in ACTIVITY:
             level = level + (square > 10.0**bound)
+        if self.each > LEVELS:
+            level = xp.where(others_seen(age), level + LEVELS, level)
         never = xp.isinf(age)
-        key = xp.where(never, float(len(self) - 1), self.bins.of_age(age) * LEVELS + level)
+        key = xp.where(never, float(len(self) - 1), self.bins.of_age(age) * self.each + level)
         last = History.last(state, as_kind(self.local.slope.mean, square))
         return xp.stack([key, square, age, last], -1)
 
     @property
     def groups(self) -> NDArray[np.int64]:
         """(keys,) group of each kind: its bin of the time since observation."""
-        return np.append(np.repeat(np.arange(len(self.bins)), LEVELS), len(self.bins))
+        return np.append(np.repeat(np.arange(len(self.bins)), self.each), len(self.bins))
+
+    @property
+    def usual(self) -> NDArray[np.int64]:
+        """(bins,) the kinds of motion as usual where nothing was observed in the meantime."""
+        return np.arange(len(self.bins)) * self.each + LEVELS - 1
 
     def measured(self, usual: Array) -> NDArray[np.int64]:
         """(keys, channels) the kind of the least time of a channel in tasks, or a longer one.
 
+        After that time, others were observed in the meantime where they report more often.
+
         Args:
-            usual: (channels,) s, gaps of the channels.
+            usual: (channels,) s, gaps of the channels; 0 where they are not known.
         """
         own = np.arange(len(self))[:, None]
-        longer = LEVELS * (self.bins.of_age(usual) - self.groups[:, None])
-        return np.asarray(own + np.where(own < len(self) - 1, np.maximum(longer, 0), 0))
+        at = self.bins.of_age(usual)
+        target = at * self.each + (own % self.each) % LEVELS
+        if self.each > LEVELS:
+            target = target + LEVELS * others_seen(np.where(usual > 0, usual, np.inf))
+        return np.asarray(
+            np.where((self.groups[:, None] < at) & (own < len(self) - 1), target, own)
+        )
 
     def ages(self) -> Array:
         """(keys,) s, upper end of the bin; infinite for the last kind."""
-        return np.append(np.repeat(self.bins.edges, LEVELS), np.inf)
+        return np.append(np.repeat(self.bins.edges, self.each), np.inf)
 
     def unit(self, kind: Any) -> Any:
         """(...) typical size of an error, in original units.
@@ -270,7 +288,8 @@ class Stack(CausalBaseline):
         own = {k: v for k, v in arrays.items() if "." not in k}
         edges = own.pop("edges")
         super().restore(own)
-        self.keys = Keys(AgeBins(edges), LocalScale().restore(within(arrays, "local.")))
+        local = LocalScale().restore(within(arrays, "local."))
+        self.keys = Keys(AgeBins(edges), local, (len(self.weights) - 1) // len(edges))
         self.members = {
             n: m for n, m in members_of(arrays).items() if isinstance(m, CausalBaseline)
         }

@@ -361,7 +361,8 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     """How much of the difference of a model from the base improves it: gamma, from 0 to 1.
 
     The least-squares factor of model - base, drawn to that of all channels of the key by `POOLED`
-    tasks, and to 0 by `CAUTION`.
+    tasks, and to 0 by `CAUTION`, as that of all channels is. A kind with fewer than `POOLED` tasks
+    has the factor of its group.
 
     Args:
         errors: on tasks that neither the base nor the model was fitted to.
@@ -383,14 +384,29 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
         return np.asarray(found.reshape(shape), dtype=np.float64)
 
     cross, square, least = summed(moved * left), summed(moved**2), summed(left**2)
+    none = effective == 0
+    few = (effective.max(axis=1) < POOLED)[:, None]
+
+    def together(table: Array) -> Array:
+        """A kind with few tasks has those of all kinds of its group."""
+        every = np.zeros_like(table)
+        np.add.at(every, errors.groups, table)
+        return np.asarray(np.where(few, every[errors.groups], table))
+
+    # In units of the base's error, kinds and channels count alike.
     many = np.maximum(effective, 1e-12)
     relative = many / np.maximum(least, 1e-9 * many)
-    pooled_square = (square * relative).sum(axis=1) + 1e-12
-    pooled = np.clip((cross * relative).sum(axis=1) / pooled_square, 0.0, 1.0)[:, None]
+    cross, square, least = (together(table * relative) for table in (cross, square, least))
+    effective = together(effective)
+    many = np.maximum(effective, 1e-12)
+    pooled = np.clip(cross.sum(axis=1) / (square.sum(axis=1) + 1e-12), 0.0, 1.0)[:, None]
+    total = effective.sum(axis=1)[:, None]
+    pooled = pooled * total / (total + CAUTION)
     typical = square / many
-    top = cross + POOLED * pooled * typical
+    # A factor above 1 from few tasks is chance; it counts as 1 beside the others.
+    top = np.minimum(cross, square) + POOLED * pooled * typical
     below = square + (POOLED + CAUTION) * typical
-    gamma = np.where(effective > 0, top / np.maximum(below, 1e-300), 0.0)
+    gamma = np.where(none, 0.0, top / np.maximum(below, 1e-300))
     # No least-squares factor is larger (Cauchy and Schwarz): where the model moves much further
     # than the base is wrong, what it says in other channels does not count.
     largest = np.sqrt(least / np.maximum(square, 1e-300))
