@@ -111,7 +111,7 @@ def draw(result: dict[str, Any], path: str) -> None:
     right.semilogx(gb, [point["peak_mb"] for point in points], "o-", label="peak, imports included")
     right.axhline(result["limit_mb"], color="0.5", ls="--", label="limit")
     right.semilogx(gb, [1e3 * size for size in gb], ":", color="0.7", label="the data")
-    right.set(xlabel="data, GB in float64", ylabel="memory, MB", ylim=(0, 1.3 * result["limit_mb"]))
+    right.set(xlabel="data, GB in float64", ylabel="memory, MB", ylim=(0, 1.6 * result["limit_mb"]))
     right.legend(frameon=False)
     figure.savefig(path, dpi=150)
 
