@@ -264,7 +264,7 @@ def _episode(
     if times:
         clock, time_unit = _clock(times, path, time_unit)
     whole = [name for name, dataset in leaves.items() if dataset.dtype.kind in "iu"]
-    stamps = {name for one, two, _ in split_stamps(whole) for name in (one, two)}
+    in_pairs = {name for one, two, _ in split_stamps(whole) for name in (one, two)}
     for name, dataset in leaves.items():
         chosen = keys is not None and any(key in keys for key in _prefixes(name))
         if keys is not None and not chosen:
@@ -277,7 +277,7 @@ def _episode(
             left.append(f"{name} ({_what(dataset)})")
         elif not chosen and (width > WIDEST or dataset.ndim > 3):
             left.append(f"{name} ({' x '.join(map(str, dataset.shape[1:]))})")
-        elif width == 1 and not chosen and (name in stamps or time_column_of([name])):
+        elif width == 1 and not chosen and (name in in_pairs or time_column_of([name])):
             left.append(f"{name} (a time)")
         elif width:
             _check_storage(dataset, path)
