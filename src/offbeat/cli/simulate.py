@@ -21,7 +21,7 @@ def simulate_command(
 
     Args:
         out: Parquet file to write.
-        robot: hopper or walker, or an MJCF file.
+        robot: hopper, walker, cheetah, humanoid, an MJCF file, or one of Gymnasium, as Hopper-v5.
         n_trajectories: how many, each from its own random state.
         rows: rows per trajectory; one per physics step, 5 ms for the hopper.
         seed: of the initial states; the thesis' protocol uses 123.

@@ -6,7 +6,9 @@ arXiv:1801.00690) in the same version of MuJoCo. Their files are our own: the su
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, InputError, require
+from offbeat.errors import FileFormatError, InputError, one_of, require
 from offbeat.registry import Registry
 
 Draw = Callable[[np.random.RandomState, Any, int], NDArray[np.float64]]
@@ -96,7 +98,7 @@ def register_robot(
 
 
 def robot_of(robot: str | Path | Robot) -> Robot:
-    """A robot by its name, or from an MJCF file.
+    """A robot by its name, from an MJCF file, or of Gymnasium, as `Hopper-v5`.
 
     Raises:
         InputError: it is neither; the message lists the names.
@@ -105,6 +107,8 @@ def robot_of(robot: str | Path | Robot) -> Robot:
         return robot
     if isinstance(robot, Path) or robot.endswith(".xml"):
         return Robot(str(robot), robot)
+    if robot not in ROBOTS and re.fullmatch(r"[\w/]+-v\d+", robot):
+        return gymnasium_robot(robot)
     return ROBOTS[robot]
 
 
@@ -146,28 +150,77 @@ def _box(*sides: tuple[int, float, float]) -> Draw:
     return draw
 
 
-def inside_joint_ranges(speed: float) -> Draw:
-    """Draws joints with limits in their range, other hinges at any angle, and no other slides.
+def inside_joint_ranges(speed: float, *, turned: bool = True) -> Draw:
+    """Draws joints with limits in their range, and no other slides.
 
-    Velocities are uniform in plus or minus `speed`.
+    Free and ball joints have any orientation, uniformly (Shoemake 1992); the position of a free
+    joint is that of the model. Velocities are uniform in plus or minus `speed`.
+
+    Args:
+        speed: largest velocity, in SI units.
+        turned: whether hinges without limits have any angle; else that of the model.
     """
 
     def draw(random: np.random.RandomState, model: Any, n: int) -> NDArray[np.float64]:
-        if model.nq != model.njnt:
-            raise InputError(
-                "initial states can be drawn without a sampler for slide and hinge joints alone; "
-                "give the robot draw=, or initial_states="
-            )
-        limited = model.jnt_limited.astype(bool)
-        hinge = model.jnt_type == require("mujoco", "sim").mjtJoint.mjJNT_HINGE.value
-        reach = np.where(hinge, np.pi, 0.0)
-        low = np.where(limited, model.jnt_range[:, 0], model.qpos0 - reach)
-        high = np.where(limited, model.jnt_range[:, 1], model.qpos0 + reach)
+        kinds = require("mujoco", "sim").mjtJoint
+        low, high = model.qpos0.copy(), model.qpos0.copy()
+        fours = []
+        for joint in range(model.njnt):
+            at, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
+            if kind in (kinds.mjJNT_FREE.value, kinds.mjJNT_BALL.value):
+                fours.append(at + 3 * (kind == kinds.mjJNT_FREE.value))
+                low[fours[-1] : fours[-1] + 4], high[fours[-1] : fours[-1] + 4] = 0.0, 1.0
+            elif model.jnt_limited[joint]:
+                low[at], high[at] = model.jnt_range[joint]
+            elif kind == kinds.mjJNT_HINGE.value and turned:
+                low[at], high[at] = low[at] - np.pi, high[at] + np.pi
         still = np.full(model.nv, speed)
         low, high = np.concatenate([low, -still]), np.concatenate([high, still])
-        return random.uniform(low, high, size=(n, len(low)))
+        states = random.uniform(low, high, size=(n, len(low)))
+        for at in fours:  # of four numbers three are used, so that a row is drawn as a whole
+            radius, one, two = states[:, at], *(2 * np.pi * states[:, at + 1 : at + 3].T)
+            near, far = np.sqrt(1 - radius), np.sqrt(radius)
+            states[:, at : at + 4] = np.stack(
+                [far * np.cos(two), near * np.sin(one), near * np.cos(one), far * np.sin(two)], 1
+            )
+        return states
 
     return draw
+
+
+def gymnasium_robot(name: str) -> Robot:
+    """A robot of Gymnasium's MuJoCo environments; its initial states are those of `reset`.
+
+    Args:
+        name: such as `Hopper-v5`.
+
+    Raises:
+        InputError: there is none of this name, or it is not one of MuJoCo.
+        MissingExtraError: gymnasium is not installed.
+    """
+    gymnasium = require("gymnasium", "robots")
+    try:
+        env = gymnasium.make(name).unwrapped
+    except gymnasium.error.Error as error:
+        what = " ".join(str(error).split())
+        raise InputError(f"Gymnasium has no robot {name!r} ({what})") from None
+    if not hasattr(env, "model") or not hasattr(env, "init_qpos"):
+        raise InputError(
+            f"{name!r} is no robot of MuJoCo, so there is nothing to simulate; give one such as "
+            "Hopper-v5"
+        )
+
+    def draw(random: np.random.RandomState, model: Any, n: int) -> NDArray[np.float64]:
+        states = np.empty((n, model.nq + model.nv))
+        for state in states:
+            env.reset(seed=int(random.randint(2**31)))
+            state[:] = np.concatenate([env.data.qpos, env.data.qvel])
+        return states
+
+    def model() -> Any:
+        return copy.copy(env.model)
+
+    return Robot(name, model, draw, description="of Gymnasium")
 
 
 _MJCF = Path(__file__).parent / "mjcf"
@@ -184,6 +237,20 @@ register_robot(
     _MJCF / "walker.xml",
     draw=inside_joint_ranges(5.0),
     description="a planar two-legged walker: 9 joints, 18 channels, 2.5 ms",
+)
+register_robot(
+    "cheetah",
+    _MJCF / "cheetah.xml",
+    # As the suite's, which then lets it settle: the torso level, at its height.
+    draw=inside_joint_ranges(5.0, turned=False),
+    description="a planar two-legged cheetah: 9 joints, 18 channels, 10 ms",
+)
+register_robot(
+    "humanoid",
+    _MJCF / "humanoid.xml",
+    # As the suite's, which draws again where the floor is touched.
+    draw=inside_joint_ranges(1.0),
+    description="a humanoid: a free joint and 21 hinges, 55 channels, 5 ms",
 )
 
 _QUATERNION = [(f"q{axis}", "1") for axis in "wxyz"]
@@ -218,6 +285,56 @@ def channels_of(model: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
                 names.append("_".join(filter(None, (joint, suffix, kind))))
                 units.append(unit)
     return tuple(names), tuple(units)
+
+
+def quaternions_of(model: Any) -> tuple[tuple[str, ...], ...]:
+    """The four channel names of each quaternion of a model.
+
+    Args:
+        model: a `mujoco.MjModel`.
+    """
+    names, _ = channels_of(model)
+    first = [i for i, name in enumerate(names) if name.endswith("qw_qpos")]
+    return tuple(names[i : i + 4] for i in first)
+
+
+_SENSED = {
+    "TOUCH": "N",
+    "FORCE": "N",
+    "TORQUE": "Nm",
+    "ACCELEROMETER": "m/s^2",
+    "GYRO": "rad/s",
+    "VELOCIMETER": "m/s",
+    "SUBTREELINVEL": "m/s",
+}
+"""Units of sensors by their type; others have none."""
+
+
+def sensors_of(model: Any, names: Sequence[str]) -> tuple[list[int], list[str], list[str]]:
+    """Positions in `sensordata`, channel names and units of some sensors.
+
+    Args:
+        model: a `mujoco.MjModel`.
+        names: of sensors; one with three components is the channels `name_x`, `name_y`, `name_z`.
+
+    Raises:
+        InputError: the model has no such sensor.
+    """
+    kinds, there = (
+        require("mujoco", "sim").mjtSensor,
+        [model.sensor(i).name for i in range(model.nsensor)],
+    )
+    index: list[int] = []
+    channels, units = [], []
+    for name in names:
+        i = there.index(one_of("sensor", name, there))
+        size, at = int(model.sensor_dim[i]), int(model.sensor_adr[i])
+        kind = kinds(int(model.sensor_type[i])).name.removeprefix("mjSENS_")
+        ends = {1: ("",), 3: ("_x", "_y", "_z")}.get(size, tuple(f"_{k}" for k in range(size)))
+        index += range(at, at + size)
+        channels += [name + end for end in ends]
+        units += [_SENSED.get(kind, "")] * size
+    return index, channels, units
 
 
 def controls_of(model: Any) -> tuple[str, ...]:

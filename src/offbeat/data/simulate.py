@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offbeat.data.arrays import hand_over
-from offbeat.data.robots import Control, Robot, channels_of, controls_of, load_model, robot_of
+from offbeat.data.robots import (
+    Control,
+    Robot,
+    channels_of,
+    controls_of,
+    load_model,
+    quaternions_of,
+    robot_of,
+    sensors_of,
+)
 from offbeat.data.trajectory import Dataset, Trajectory
+from offbeat.data.transforms import META_KEY, Transforms
 from offbeat.errors import DivergenceError, InputError, require
 from offbeat.progress import progress_bar
 
@@ -27,9 +37,10 @@ def simulate(
     n_trajectories: int = 10_000,
     rows: int = 200,
     *,
-    controls: Control | ArrayLike | None = None,
+    controls: Control | ArrayLike | Any | None = None,
     seed: int = 0,
     initial_states: ArrayLike | None = None,
+    sensors: Sequence[str] = (),
     threads: int | None = None,
     progress: bool = True,
 ) -> Dataset:
@@ -41,20 +52,24 @@ def simulate(
     trajectories of a larger data set are those of a smaller one.
 
     Args:
-        robot: name of the robot, one of `offbeat.data.robots.ROBOTS`; an MJCF file; or a `Robot`.
+        robot: name of the robot, one of `offbeat.data.robots.ROBOTS`, or of an environment of
+            Gymnasium that runs in MuJoCo, such as `Hopper-v5`; an MJCF file; or a `Robot`.
         n_trajectories: number of trajectories; ignored with `initial_states`.
         rows: rows per trajectory, at least 2.
         controls: a function of the time (s) and the (nq + nv,) positions and velocities that gives
             (nu,) controls, or recorded ones, (rows, nu) for all trajectories or
             (n, rows, nu); by default those of the robot, or none. A function is called in one
-            thread.
+            thread. A `Policy` of these positions and velocities is reset for every trajectory.
         seed: seed of the initial states, 0 to 2**32 - 1.
         initial_states: (n, nq + nv) positions, then velocities, instead of the robot's own draw.
+        sensors: names of sensors and contacts of the model, such as `left_hand_touch`, which
+            become further channels.
         threads: number of threads; by default one per available core.
         progress: show a progress bar on standard error.
 
     Returns:
-        Trajectories with one channel per position and velocity; `meta` holds the robot, the seed
+        Trajectories with one channel per position and velocity, quaternions with the transform of
+        quaternions, then one per component of each sensor; `meta` holds the robot, the seed
         (None with given states), the time step and the versions of the software.
 
     Raises:
@@ -75,21 +90,24 @@ def simulate(
         states = _given_states(initial_states, model)
     given = controls if controls is not None else entry.control
     names, units = channels_of(model)
-    if callable(given):
-        kind = "function"
-        values, acted = _step(entry.name, model, states, rows, given, progress)
+    sensed, sensor_names, sensor_units = sensors_of(model, sensors)
+    names, units = (*names, *sensor_names), (*units, *sensor_units)
+    if callable(given) or hasattr(given, "act"):
+        kind = "function" if callable(given) else "policy"
+        values, acted = _step(entry.name, model, states, rows, given, progress, sensed)
     elif given is not None:
         kind = "recorded"
         acted = _recorded(given, (len(states), rows, model.nu))
-        values = _roll_out(entry.name, model, states, rows, threads, progress, acted)
+        values = _roll_out(entry.name, model, states, rows, threads, progress, acted, sensed)
     else:
         kind = "zero"
-        values = _roll_out(entry.name, model, states, rows, threads, progress)
+        values = _roll_out(entry.name, model, states, rows, threads, progress, None, sensed)
     roles = ("state",) * len(names)
     if given is not None:
         values = np.concatenate([values, acted], axis=2)
         names, units = (*names, *controls_of(model)), (*units, *[""] * model.nu)
         roles = (*roles, *["action"] * model.nu)
+    fours = quaternions_of(model)
     timestep = float(model.opt.timestep)
     times = hand_over(np.arange(rows, dtype=np.float64) * timestep)
     hand_over(values)
@@ -106,6 +124,7 @@ def simulate(
             "timestep_s": timestep,
             "control": kind,
             "versions": _versions(),
+            **({META_KEY: Transforms(quaternions=fours).to_dict()} if fours else {}),
         },
     )
 
@@ -125,8 +144,12 @@ def _roll_out(
     threads: int,
     progress: bool,
     controls: NDArray[np.float64] | None = None,
+    sensed: Sequence[int] = (),
 ) -> NDArray[np.float64]:
-    """Steps every initial state: (n, nq + nv), with (n, rows, nu), to (n, rows, nq + nv)."""
+    """Steps every initial state: (n, nq + nv), with (n, rows, nu), to (n, rows, nq + nv + sensed).
+
+    A step computes the sensors of the state that it begins with.
+    """
     mujoco = require("mujoco", "sim")
     rollout = require("mujoco.rollout", "sim")
     _keep_unstable_states(mujoco, model)
@@ -137,8 +160,8 @@ def _roll_out(
     full[1:] = full[0]
     width = states.shape[1]
     full[:, 1 : 1 + width] = states
-    values = np.empty((len(states), rows, width))
-    values[:, 0] = states
+    values = np.empty((len(states), rows, width + len(sensed)))
+    values[:, 0, :width] = states
     chunk = max(threads, _ROWS_PER_CHUNK // rows)
     with (
         _collected_warnings(mujoco) as warnings,
@@ -150,9 +173,11 @@ def _roll_out(
             # After a warning the rollout repeats that row. One more step than needed makes this
             # visible in the clock for warnings of the last row as well.
             acted = None if controls is None else controls[part]
-            stepped, _ = pool.rollout(model, data, full[part], acted, nstep=rows)
+            stepped, measured = pool.rollout(model, data, full[part], acted, nstep=rows)
             _check_stable(robot, stepped, start, warnings)
-            values[part, 1:] = stepped[:, : rows - 1, 1 : 1 + width]
+            values[part, 1:, :width] = stepped[:, : rows - 1, 1 : 1 + width]
+            if len(sensed):
+                values[part, :, width:] = measured[:, :, list(sensed)]
             bar.update(part.stop - part.start)
     return values
 
@@ -162,24 +187,29 @@ def _step(
     model: Any,
     states: NDArray[np.float64],
     rows: int,
-    control: Control,
+    control: Any,
     progress: bool,
+    sensed: Sequence[int],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """As `_roll_out`, with the controls of a function, which are returned, too."""
     mujoco = require("mujoco", "sim")
     _keep_unstable_states(mujoco, model)
-    values = np.empty((len(states), rows, states.shape[1]))
+    width = states.shape[1]
+    values = np.empty((len(states), rows, width + len(sensed)))
     acted = np.empty((len(states), rows, model.nu))
-    stepped = np.empty((1, rows, 1 + states.shape[1]))
+    stepped = np.empty((1, rows, 1 + width))
     with _collected_warnings(mujoco) as warnings:
         rows_of = range(len(states))
         for i in progress_bar(rows_of, desc=robot, unit=" trajectories", show=progress):
             data = mujoco.MjData(model)
             data.qpos[:], data.qvel[:] = states[i, : model.nq], states[i, model.nq :]
-            values[i, 0] = states[i]
+            values[i, 0, :width] = states[i]
             stepped[:] = np.nan
+            if not callable(control):
+                control.reset()
+            act = control if callable(control) else control.act
             for row in range(rows):
-                given = np.asarray(control(data.time, values[i, row].copy()), dtype=np.float64)
+                given = np.asarray(act(data.time, values[i, row, :width].copy()), dtype=np.float64)
                 if given.shape != (model.nu,) or not np.isfinite(given).all():
                     raise InputError(
                         f"controls of {robot!r} must be {model.nu} finite numbers, got "
@@ -187,11 +217,12 @@ def _step(
                     )
                 acted[i, row] = data.ctrl[:] = given
                 mujoco.mj_step(model, data)
+                values[i, row, width:] = data.sensordata[list(sensed)]
                 if np.any(data.warning.number):
                     break
                 stepped[0, row] = np.concatenate([[data.time], data.qpos, data.qvel])
                 if row + 1 < rows:
-                    values[i, row + 1] = stepped[0, row, 1:]
+                    values[i, row + 1, :width] = stepped[0, row, 1:]
             _check_stable(robot, stepped, i, warnings)
     return values, acted
 
