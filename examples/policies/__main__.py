@@ -1,0 +1,154 @@
+"""Clones policies and their rivals, runs them, and writes the tables of `docs/policies.md`.
+
+    python -m examples.policies --robot pendulum --seeds 3
+    python -m examples.policies --robot pendulum --document docs/policies.md
+
+A file per rival, training and seed is kept in `results/policies/ROBOT`; what is there is not run
+again. It needs `offbeat[robots]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from examples.real_logs.results import machine
+from offbeat.data.trajectory import Dataset
+from offbeat.files import write_json
+from offbeat.policies import CloneConfig, Drops, HeldController, demonstrate, fit_policy, rollout
+
+from . import report
+from .rivals import RIVALS, options_of
+from .robots import Robot, robots
+
+RESULTS = Path("results/policies")
+TRAININGS = {"drops": Drops(frames=0.9), "no drops": Drops(frames=0.0)}
+
+
+def conditions(robot: Robot) -> dict[str, dict[str, Any]]:
+    """What is lost and late in a test, by name."""
+    frames = {f"{100 * d:.0f} %": {"drop": d} for d in (0.0, 0.3, 0.5, 0.7, 0.9)}
+    return {
+        **frames,
+        "bursts": {"bursts": 0.3, "burst_s": (2 * robot.dt, 10 * robot.dt)},
+        "sensors": {"sensor_drop": 0.5},
+        "delay": {"delay_s": 2 * robot.dt},
+    }
+
+
+class Random:
+    """Acts at random, uniformly within bounds."""
+
+    def __init__(self, bounds: tuple[float, float], actions: int) -> None:
+        self.bounds, self.actions = bounds, actions
+
+    def reset(self, n: int | None = None) -> None:
+        """Begins episodes of n robots."""
+        self.n, self.random = n or 1, np.random.default_rng(0)
+
+    def act(self, t: Any, observation: Any, mask: Any, *, now: Any) -> Any:
+        """(n, actions)."""
+        return self.random.uniform(*self.bounds, (self.n, self.actions))
+
+
+def tested(controller: Any, robot: Robot, episodes: int, steps: int | None) -> dict[str, Any]:
+    """Returns of a controller under all conditions; the same starts and losses for every one."""
+    return {
+        name: rollout(
+            controller, robot.env, episodes, seed=50_000, steps=steps, **lost
+        ).returns.tolist()
+        for name, lost in conditions(robot).items()
+    }
+
+
+def shown(robot: Robot) -> tuple[Dataset, Dataset]:
+    """Demonstrations to train and to validate."""
+    count = robot.demonstrations
+    train, validation = (
+        demonstrate(robot.expert, robot.env, n, seed=seed, noise=robot.noise, names=robot.names)
+        for n, seed in ((count, 1000), (count // 5, 9000))
+    )
+    return train, validation
+
+
+def main(given: list[str] | None = None) -> None:
+    """Runs the command."""
+    parser = argparse.ArgumentParser(
+        "python -m examples.policies", description=__doc__.split("\n")[0]
+    )
+    add = parser.add_argument
+    add("--robot", default="pendulum", help=f"one of {', '.join(robots())}")
+    add("--seeds", type=int, default=3, help="trainings of each rival")
+    add("--training", default="drops", choices=TRAININGS, help="what is lost in training")
+    add("--only", default="", help="names of rivals, separated by semicolons")
+    add("--episodes", type=int, default=20)
+    add("--steps", type=int, help="that an episode of a test is cut off after")
+    add("--minutes", type=float, help="stop after the run that is in progress then")
+    add("--document", type=Path, help="write the tables into this document instead")
+    asked = parser.parse_args(given)
+    robot, folder = robots()[asked.robot], RESULTS / asked.robot
+    if asked.document is not None:
+        report.write(asked.document, folder, asked.robot)
+        return
+    torch.set_num_threads(1)
+    stop = time.monotonic() + 60 * (asked.minutes or 1e9)
+    if not (folder / "expert.json").exists():
+        probe = demonstrate(robot.expert, robot.env, 1, seed=1, names=robot.names)
+        width = sum(role == "action" for role in probe.roles)
+        for name, one in (
+            ("expert", HeldController(robot.expert)),
+            ("random", Random(robot.bounds, width)),
+        ):
+            found = tested(one, robot, asked.episodes, asked.steps)
+            write_json(folder / f"{name}.json", {"rival": f"{name}, last value", "returns": found})
+    train = None
+    chosen = [name.strip() for name in asked.only.split(";") if name.strip()] or list(RIVALS)
+    for seed in range(asked.seeds):
+        for name in chosen:
+            words = f"{name} {asked.training}".replace(",", "").replace(" ", "_")
+            path = folder / f"{words}-{seed}.json"
+            if path.exists():
+                continue
+            if time.monotonic() > stop:
+                return
+            if train is None:
+                train, validation = shown(robot)
+            model, options = options_of(name)
+            config = CloneConfig(epochs=robot.epochs, window=robot.window, seed=seed)
+            began = time.process_time()
+            policy = fit_policy(
+                train,
+                model,
+                validation=validation,
+                bounds=([robot.bounds[0]], [robot.bounds[1]]),
+                drops=TRAININGS[asked.training],
+                config=config,
+                progress=False,
+                **options,
+            )
+            seconds = time.process_time() - began
+            found = tested(policy, robot, asked.episodes, asked.steps)
+            write_json(
+                path,
+                {
+                    "rival": name,
+                    "training": asked.training,
+                    "seed": seed,
+                    "returns": found,
+                    "validation": min(record.validation for record in policy.log),
+                    "parameters": sum(p.numel() for p in policy.model.parameters()),
+                    "training_seconds": round(seconds, 1),
+                    "machine": machine(),
+                },
+            )
+            means = " ".join(f"{k} {np.mean(v):.0f};" for k, v in found.items())
+            print(f"{name} {asked.training} {seed}: {seconds:.0f} s, {means}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""The robots of the comparison: an environment, an expert, and what is demonstrated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load_file
+
+from . import pendulum
+
+HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Robot:
+    """An environment with an expert.
+
+    Attributes:
+        env: name of the environment.
+        expert: (..., observations) to (..., actions).
+        bounds: of the actions.
+        demonstrations: episodes that are trained on; a fifth as many validate.
+        noise: of the actions that are executed in demonstrations.
+        dt: s, between steps.
+        names: of the observed channels.
+        epochs: of a training.
+        window: rows of the windows.
+    """
+
+    env: str
+    expert: Callable[[Any], Any]
+    bounds: tuple[float, float]
+    demonstrations: int
+    noise: float
+    dt: float
+    names: tuple[str, ...] | None = None
+    epochs: int = 150
+    window: int = 50
+
+
+def linear(path: Path) -> Callable[[Any], Any]:
+    """The expert that `examples.policies.expert` wrote.
+
+    Args:
+        path: its file.
+    """
+    tensors = load_file(path)
+    matrix, mean = tensors["matrix"], tensors["mean"]
+    return lambda seen: np.clip((np.asarray(seen) - mean) @ matrix.T, -1.0, 1.0)
+
+
+def robots() -> dict[str, Robot]:
+    """Those whose experts are there."""
+    found = {
+        "pendulum": Robot(
+            "Pendulum-v1", pendulum.expert, (-2.0, 2.0), 50, 0.3, 0.05, pendulum.NAMES
+        )
+    }
+    for name, env, dt in (("hopper", "Hopper-v5", 0.008), ("half_cheetah", "HalfCheetah-v5", 0.05)):
+        path = HERE / f"{name}.safetensors"
+        if path.exists():
+            found[name] = Robot(env, linear(path), (-1.0, 1.0), 40, 0.1, dt, epochs=40)
+    return found
