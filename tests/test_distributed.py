@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -58,8 +59,13 @@ def test_two_ranks_train_as_one_up_to_rounding_and_with_the_same_bits_as_each_ot
 
 
 def test_a_lost_rank_ends_the_run_which_resumes_with_another_number_of_ranks(alone, tmp_path):
-    (first, said), (last, _) = started(2, tmp_path, 2, "gru_d", 1)
-    assert last == 7
+    for folder in (tmp_path / str(k) for k in range(3)):
+        folder.mkdir()
+        (first, said), (last, _) = started(2, folder, 2, "gru_d", 1)
+        assert last == 7
+        if first != -signal.SIGABRT:  # a thread of gloo ends the process, on a busy machine
+            break
+    tmp_path = folder
     assert first == 3
     assert "LostRankError: a rank was lost, as rank 0 of 2 sees it" in said
     assert "continues from the last checkpoint, with any number of ranks" in said

@@ -63,13 +63,13 @@ def dependencies() -> list[tuple[str, str]]:
         declared = importlib.metadata.requires("offbeat") or []
     except importlib.metadata.PackageNotFoundError:
         return []
-    found = []
+    found: dict[str, str] = {}
     for text in declared:
         named, asked = re.match(r"[\w.-]+", text), re.search(r"extra == ['\"]([^'\"]+)", text)
         extra = asked[1] if asked else ""
         if named and named[0] != "offbeat" and extra not in FOR_DEVELOPERS:
-            found.append((named[0], extra))
-    return found
+            found.setdefault(named[0], extra)
+    return list(found.items())
 
 
 def _scan_backend() -> str:

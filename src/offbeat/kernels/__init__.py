@@ -159,6 +159,7 @@ register_backend(
         available=lambda: () if triton_backend.why_not() else ("triton",),
         why_not=lambda: triton_backend.why_not(),
         fix="install triton where a GPU is, or set TRITON_INTERPRET=1",
+        devices=("cuda",),  # interpreted, it must be named
     )
 )
 register_backend(

@@ -39,6 +39,7 @@ class Backend:
         perceptron: (layers, x, activation, variant) to the outputs, or to None if the call
             cannot run; None for a backend without one.
         training: a context manager for training with this backend.
+        devices: types of the devices on which `auto` tries it.
         capturable: on a GPU, a whole training step with it can be recorded in a CUDA graph: nothing
             in it waits for the GPU.
     """
@@ -54,6 +55,7 @@ class Backend:
     fix: str = "install Offbeat where a C++ compiler is available"
     perceptron: Callable[[Layers, Tensor, str, str | None], Tensor | None] | None = None
     training: Callable[[], AbstractContextManager[None]] = nullcontext
+    devices: tuple[str, ...] = ("cpu", "cuda")
     capturable: bool = True
 
     def runnable(self) -> Sequence[str]:
@@ -125,7 +127,7 @@ def choose(
     reasons = []
     if name == "auto":
         for backend in reversed(list(BACKENDS.values())):
-            if backend is reference:
+            if backend is reference or device.type not in backend.devices:
                 continue
             reason = _why_not(backend, spec, dtype, device)
             if reason is None:

@@ -22,6 +22,9 @@ from offbeat.sweeps.task import Task
 
 _ATTEMPTS = 3
 
+WAITS = 10.0
+"""The record is written again after this many times the time that writing it took."""
+
 
 class Session:
     """One session: sends tasks to an engine and writes the record after each run.
@@ -158,7 +161,7 @@ class Session:
         What is not written yet is in the folders of the runs, where the next call finds it.
         """
         began = time.monotonic()
-        if self._unwritten and (now or began - self._written_at >= 10 * self._write_s):
+        if self._unwritten and (now or began - self._written_at >= WAITS * self._write_s):
             self.record.write(self.out)
             self._written_at = time.monotonic()
             self._write_s, self._unwritten = self._written_at - began, False
