@@ -81,7 +81,8 @@ def write(document: Path, folder: Path, robot: str) -> None:
         folder: of the results.
         robot: name of the marks.
     """
-    tables = [table(folder, training) for training in TITLES]
+    run = {_read(path)["training"] for path in folder.glob("*-*.json")}
+    tables = [table(folder, training) for training in TITLES if training in run]
     text = document.read_text(encoding="utf-8")
     before, rest = text.split(f"<!-- {robot} -->")
     _, after = rest.split(f"<!-- end of {robot} -->")
