@@ -108,8 +108,8 @@ def one_of(what: str, got: str, choices: Iterable[str], *, whole: bool = False) 
     raise InputError(f"unknown {what} {given}, expected one of: {shown}{hint}")
 
 
-def listed(names: Sequence[str], most: int = 20, *, quoted: bool = True) -> str:
-    """Names that a file holds, for messages.
+def listed(names: Sequence[str], most: int = 20, *, quoted: bool = False) -> str:
+    """Names for messages and notes.
 
     Of many or long names, the first ones are given, and the number of the rest.
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from offbeat.config import SplitConfig
 from offbeat.data.cleaning.channels import find_repeats
-from offbeat.data.cleaning.log import listed
 from offbeat.data.inspection import without_repeats
 from offbeat.data.outliers import mask_outliers
 from offbeat.data.redundant import Redundant, find_redundant, leave_out
@@ -21,7 +20,7 @@ from offbeat.data.splits import apply_split
 from offbeat.data.tasks import TaskConfig
 from offbeat.data.trajectory import STATE, Dataset, known_values
 from offbeat.data.transforms import Angle, Transforms, full_turn, is_angle_unit, lowest_of
-from offbeat.errors import InputError
+from offbeat.errors import InputError, listed
 
 CHOSEN = ("outliers", "repeated", "angles")
 """Options of readers that are chosen."""

@@ -18,7 +18,7 @@ from offbeat.data.cleaning.anomalies import merge_rows
 from offbeat.data.cleaning.channels import find_repeats, make_continuous, new_values, unwrap
 from offbeat.data.cleaning.clocks import NANOSECONDS_PER
 from offbeat.data.cleaning.described import Channels
-from offbeat.data.cleaning.log import CleaningLog, listed
+from offbeat.data.cleaning.log import CleaningLog
 from offbeat.data.cleaning.merging import Episode, cut
 from offbeat.data.cleaning.options import ReaderOptions as ReaderOptions
 from offbeat.data.outliers import search
@@ -26,7 +26,7 @@ from offbeat.data.signals import Recording as Recording
 from offbeat.data.signals import Signal as Signal
 from offbeat.data.trajectory import Dataset
 from offbeat.data.transforms import lowest_of
-from offbeat.errors import FileFormatError
+from offbeat.errors import FileFormatError, listed
 
 
 def assemble(recordings: Iterable[Recording], options: ReaderOptions | None = None) -> Dataset:

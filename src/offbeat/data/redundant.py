@@ -9,10 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.log import listed
 from offbeat.data.trajectory import ACTION, EXOGENOUS, STATE, Dataset, known_values
 from offbeat.data.transforms import Transforms
-from offbeat.errors import InputError
+from offbeat.errors import InputError, listed
 
 _FEWEST = 20  # values of a counter or a copy
 _FEW = 3  # distinct values of a copy, fewer than which two switches may agree by chance

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.log import listed
 from offbeat.data.scaler import clipped
 from offbeat.data.trajectory import STATE, Dataset, known_values
+from offbeat.errors import listed
 
 _FEWEST = 20  # values of a channel that are compared
 _LAG = 10  # values, over which motion is measured

@@ -9,11 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from offbeat.data.cleaning.channels import find_quaternions
-from offbeat.data.cleaning.log import listed
 from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.signals import MOST_CHANNELS, Recording, Signal
 from offbeat.data.transforms import full_turn
-from offbeat.errors import FileFormatError, InputError, one_of
+from offbeat.errors import FileFormatError, InputError, listed, one_of
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.outliers import Outliers
+from offbeat.errors import listed
 
 
 @dataclass
@@ -214,9 +215,3 @@ def _rows(count: int) -> str:
 
 def _were(count: int) -> str:
     return "was" if count == 1 else "were"
-
-
-def listed(names: list[str], most: int = 6) -> str:
-    """Names for messages; of many names, the first ones and the number of the rest."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

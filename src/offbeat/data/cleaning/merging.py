@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning import anomalies
 from offbeat.data.cleaning.described import Channels
-from offbeat.data.cleaning.log import CleaningLog, listed
+from offbeat.data.cleaning.log import CleaningLog
 from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.signals import Recording, Signal
 from offbeat.data.trajectory import Trajectory
-from offbeat.errors import FileFormatError, InputError
+from offbeat.errors import FileFormatError, InputError, listed
 
 _FEW, _ONE_IN = 2, 20  # rows that may lose a value to another one of their stamp, or a fraction
 _DAY = 86_400 * 10**9

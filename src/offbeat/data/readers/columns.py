@@ -146,8 +146,8 @@ class Columns:
         rest = [name for name in others if name != label]
         if not rest:
             raise FileFormatError(
-                f"{path} has no channels, only the columns {listed(names)}; it needs one column "
-                "per channel besides the time"
+                f"{path} has no channels, only the columns {listed(names, quoted=True)}; it needs "
+                "one column per channel besides the time"
             )
         found = replace(stamp, label=label)
         key, value = _long_form(rest, options, sample)
@@ -227,18 +227,19 @@ class Columns:
             if stamps:
                 notes = (
                     *notes,
-                    f"columns of further stamps are left out: {listed([*itertools.chain(*stamps)])}"
-                    "; time_column= takes two of them as the time",
+                    "columns of further stamps are left out: "
+                    f"{listed([*itertools.chain(*stamps)], quoted=True)}; time_column= takes two "
+                    "of them as the time",
                 )
             if texts:
                 notes = (
                     *notes,
-                    f"columns of text are left out: {listed(texts, 6)}",
+                    f"columns of text are left out: {listed(texts, 6, quoted=True)}",
                 )
             if not kept:
                 raise FileFormatError(
                     f"{path} has no column of numbers besides the time, expected one per channel; "
-                    f"left out: {listed(left, 6)}"
+                    f"left out: {listed(left, 6, quoted=True)}"
                     + (
                         f", with text such as {_first(sample.texts(texts[0]))[:60]!r}"
                         if texts
@@ -307,7 +308,8 @@ def stamp_columns(
                     return joined(given[0], given[1], tried)
         raise InputError(
             f"{path}: time_column must name one column, or two with whole seconds and the "
-            f"nanoseconds beside them, or with a date and a time of day, got {listed(given)}"
+            "nanoseconds beside them, or with a date and a time of day, got "
+            f"{listed(given, quoted=True)}"
         )
     if options.rate_hz is not None:
         return made("", note=f"stamps are row number / {options.rate_hz:g} Hz, as rate_hz says")
@@ -337,7 +339,7 @@ def stamp_columns(
         )
     raise FileFormatError(
         f"{path} has no {what} of times: one must be called {', '.join(TIME_NAMES[:3])}, ... got "
-        f"{listed(names, 12)}; say which one with time_column=, or give rate_hz="
+        f"{listed(names, 12, quoted=True)}; say which one with time_column=, or give rate_hz="
     )
 
 

@@ -124,7 +124,7 @@ class CsvFile:
 
     def _refuse(self, names: list[str], problem: str) -> None:
         raise FileFormatError(
-            f"{self.path} has {problem} in its header, got {listed(names)}; "
+            f"{self.path} has {problem} in its header, got {listed(names, quoted=True)}; "
             "give every column a name of its own"
         )
 
@@ -346,7 +346,7 @@ class CsvFile:
     def _wrong_count(self, line: int, count: int, header: list[str]) -> FileFormatError:
         return FileFormatError(
             f"{self.path} has {count} fields in line {line}, expected {len(header)}, "
-            f"one per column: {listed(header)}"
+            f"one per column: {listed(header, quoted=True)}"
         )
 
     def _ends_a_line(self) -> bool:
@@ -385,7 +385,7 @@ class CsvFile:
         gone = [columns.channels[c] for c in texts]
         values = table.values[:, kept]
         return (
-            columns.only(kept, [f"columns of text are left out: {listed(gone, 6)}"]),
+            columns.only(kept, [f"columns of text are left out: {listed(gone, 6, quoted=True)}"]),
             Gathered(table.clock, table.labels, table.keys, values),
         )
 

@@ -122,7 +122,7 @@ def recordings(
             raise FileFormatError(
                 f"{path} is laid out neither like robomimic (data/demo_0/obs) nor like Minari "
                 "(episode_0/observations); it holds: "
-                f"{listed(sorted(file), quoted=False) or 'nothing'}"
+                f"{listed(sorted(file)) or 'nothing'}"
             )
         if mask is not None:
             episodes = _masked(file, mask, episodes, path)
@@ -285,13 +285,13 @@ def _episode(
     if not arrays:
         raise FileFormatError(
             f"{path}: {episode.name} holds no observations that are numbers; it has: "
-            f"{listed(list(leaves), quoted=False) or 'none'}"
+            f"{listed(list(leaves)) or 'none'}"
         )
     rows = {name: len(values) for name, values in arrays.items()}
     if len(set(rows.values())) > 1 or (clock and len(clock[1]) not in rows.values()):
         raise FileFormatError(
             f"{path}: observations of {episode.name} differ in their rows: "
-            + listed([f"{name} {n}" for name, n in rows.items()], quoted=False)
+            + listed([f"{name} {n}" for name, n in rows.items()])
         )
     n = next(iter(rows.values()))
     label = episode.name.rpartition("/")[2]
@@ -308,7 +308,11 @@ def _episode(
         except FileFormatError as error:
             raise FileFormatError(f"{path}: {clock[0]!r} of {label}: {error}") from None
         joined = len(times) == 2
-        what = f"joined from the arrays {listed([*times])}" if joined else f"the array {clock[0]!r}"
+        what = (
+            f"joined from the arrays {listed([*times], quoted=True)}"
+            if joined
+            else f"the array {clock[0]!r}"
+        )
         notes = (f"stamps are {what}", *more)
     else:
         unit, zero = "s", 0
@@ -378,14 +382,14 @@ def _times(
         if len(parts) != 1:
             raise InputError(
                 f"{path}: time_column must name one array, or two with whole seconds and what is "
-                f"left of each in ns, us or ms, got {listed(parts)}"
+                f"left of each in ns, us or ms, got {listed(parts, quoted=True)}"
             )
         name = parts[0]
     else:
         name = time_column_of(usual) or ""
         together = [pair for pair in pairs if name in pair or not name]
         if len(together) > 1:
-            shown = listed([f"[{one}, {two}]" for one, two in together], 3, quoted=False)
+            shown = listed([f"[{one}, {two}]" for one, two in together], 3)
             raise FileFormatError(
                 f"{path} has several stamps, each in two arrays: {shown}; say which one is the "
                 "time with time_column="

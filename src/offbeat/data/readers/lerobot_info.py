@@ -151,7 +151,7 @@ class Info:
         if not chosen:
             raise FileFormatError(
                 f"{self.root} has no features that are numbers but actions and bookkeeping; "
-                f"choose with columns= from: {listed(list(self.features), 12)}"
+                f"choose with columns= from: {listed(list(self.features), 12, quoted=True)}"
             )
         return chosen, [f"left out unless chosen with columns=: {', '.join(left)}"] if left else []
 
@@ -170,7 +170,7 @@ class Info:
             if len(parts) != 1 and parts not in pairs:
                 raise InputError(
                     f"{self.root}: time_column must name one column, or two with whole seconds and "
-                    f"what is left of each in ns, us or ms, got {listed(parts)}"
+                    f"what is left of each in ns, us or ms, got {listed(parts, quoted=True)}"
                 )
             return [parts]
         named = [(f.name,) for f in self.features.values() if f.is_time]
@@ -179,7 +179,7 @@ class Info:
         if len(pairs) > 1 and not measured:
             raise FileFormatError(
                 f"{self.root} has several stamps, each in two columns: "
-                f"{listed([f'[{one}, {two}]' for one, two in pairs], 3, quoted=False)}; say which "
+                f"{listed([f'[{one}, {two}]' for one, two in pairs], 3)}; say which "
                 "one is the time with time_column="
             )
         # measured stamps take precedence over LeRobot's
@@ -307,8 +307,8 @@ def read_columns(path: Path, columns: list[str]) -> Any:
             missing = [name for name in columns if name not in file.schema_arrow.names]
             if missing:
                 raise FileFormatError(
-                    f"{path} has no column {listed(missing, 1)}, expected as meta/info.json says; "
-                    f"it has: {listed(file.schema_arrow.names, quoted=False)}"
+                    f"{path} has no column {listed(missing, 1, quoted=True)}, expected as "
+                    f"meta/info.json says; it has: {listed(file.schema_arrow.names)}"
                 )
             return file.read(columns=columns)
     except FileFormatError:

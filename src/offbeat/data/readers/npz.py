@@ -102,7 +102,7 @@ def read_npz(
     left += beside
     if not any(array.dtype.kind in "biuf" for array in table.values()):
         others = [f"{name} {array.shape}" for name, array in arrays.items() if name != stamp.time]
-        shapes = listed(others, quoted=False) or "nothing"
+        shapes = listed(others) or "nothing"
         raise FileFormatError(
             f"{path} has no array with a row for each of the {shape} times in {stamp.time!r}, "
             f"besides them it has {shapes}"

@@ -110,7 +110,7 @@ def recordings(
     for topic in readers.values():
         signals.extend(topic.signals(header=clocks[topic.name], notes=notes))
     if not signals:
-        topics = listed(list(readers), 4, quoted=False) or "any of its topics"
+        topics = listed(list(readers), 4) or "any of its topics"
         raise FileFormatError(
             f"{path} holds no numbers in {topics}; it has the topics "
             f"{_listed(bag.connections)}; choose with topics="
@@ -120,7 +120,7 @@ def recordings(
 
 def _listed(connections: Sequence[Connection]) -> str:
     topics = {c.topic: f"{c.topic} ({c.kind})" for c in connections}
-    return listed([topics[name] for name in sorted(topics)], quoted=False) or "none"
+    return listed([topics[name] for name in sorted(topics)]) or "none"
 
 
 def _chosen(

@@ -98,7 +98,7 @@ def recordings(
             raise FileFormatError(
                 f"{path} holds none of the topics that are read by default "
                 f"({', '.join(DEFAULTS)}); choose with topics= from: "
-                f"{listed(left, quoted=False) or 'none'}"
+                f"{listed(left) or 'none'}"
             )
         if left:
             more = f" and {len(left) - 8} more" if len(left) > 8 else ""
@@ -122,7 +122,7 @@ def recordings(
     pick.check()
     if not signals:
         raise FileFormatError(
-            f"{path} holds no numbers in {listed(list(chosen), quoted=False)}; choose with topics="
+            f"{path} holds no numbers in {listed(list(chosen))}; choose with topics="
         )
     yield Recording(tuple(signals), origin=path.name, time_unit="us", notes=tuple(notes))
 
