@@ -203,7 +203,7 @@ def _forecast(blend: Blend, new: Trajectory) -> tuple[Span, tuple[str, ...]]:
     )
     near = _between(new, start - 2.0, start + horizon + 0.1)
     hidden = near.observed & (near.times <= start)[:, None]
-    title = f"Forecast from {start:.1f} s on, from the past alone"
+    title = f"Forecast from {start:.1f} s on"
     span = Span(
         title,
         replace(near, observed=hidden),
