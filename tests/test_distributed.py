@@ -91,6 +91,13 @@ def test_without_torchrun_there_is_no_group(monkeypatch):
         assert ranks is None
 
 
+def test_a_rank_without_others_says_what_is_wrong(monkeypatch, capsys, tmp_path):
+    monkeypatch.setenv("RANK", "3")  # as some job systems set it
+    monkeypatch.delenv("WORLD_SIZE", raising=False)
+    assert main(["predict", "nothing", str(tmp_path / "a.csv"), str(tmp_path / "b.csv")]) == 2
+    assert "nothing" in capsys.readouterr().err
+
+
 def test_the_launch_of_ranks_that_is_not_complete_is_one_line(monkeypatch, capsys, tmp_path):
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setenv("RANK", "0")

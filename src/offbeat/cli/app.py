@@ -163,8 +163,8 @@ def run_commands(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (OffbeatError, OSError) as error:
-        if os.environ.get("RANK", "0") != "0" and not isinstance(error, ConnectionError):
-            return 2  # the first of several ranks says it
+        if _is_a_later_rank() and not isinstance(error, ConnectionError):
+            return 2  # the first rank says it
         said = of_system(error) if isinstance(error, OSError) else str(error)
         said = parsers[command].spoken(said) if command else said
         return _fail(said, 1 if isinstance(error, ArithmeticError | ConnectionError) else 2)
@@ -200,6 +200,11 @@ def _said(*, quiet: bool, verbose: bool) -> Iterator[None]:
         logger.removeHandler(handler)
         logger.setLevel(level)
         print(f"offbeat: {time.monotonic() - began:.1f} s", file=sys.stderr)
+
+
+def _is_a_later_rank() -> bool:
+    """Whether `torchrun` started this process as one of several, and not as the first."""
+    return os.environ.get("RANK", "0") != "0" and os.environ.get("WORLD_SIZE", "1") != "1"
 
 
 def _missing(error: ModuleNotFoundError) -> int:
