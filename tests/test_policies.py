@@ -224,6 +224,11 @@ def test_the_onnx_file_acts_as_the_policy(name, tmp_path):
     other.restore(state)
     assert np.array_equal(other.act(times[-1] + 0.1), one)
     assert np.allclose(one, policy.act(times[-1] + 0.1), atol=1e-9)
+    with pytest.raises(ob.InputError, match="state is of another policy"):
+        other.restore({"state": np.zeros((1, 1))})
+    with pytest.raises(ob.InputError, match="t must be a finite time"):
+        other.act(np.nan)
+    assert np.allclose(other.act(times[-1] + 0.2), policy.act(times[-1] + 0.2), atol=1e-9)
 
 
 def test_a_file_that_is_no_policy_is_refused(tmp_path):
@@ -353,6 +358,8 @@ def test_a_registered_module_is_a_policy_on_its_newest_rows(held_model, tmp_path
     chosen = acted(policy, times, values, masks)
     state = policy.state()
     expected = policy.act(times[-1] + 1, [0.1, 0.2])
+    with pytest.raises(ob.InputError, match="state is of another model: it differs in"):
+        policy.restore(small("gru").state())
     policy.restore(state)
     assert np.array_equal(policy.act(times[-1] + 1, [0.1, 0.2]), expected)
     assert np.array_equal(policy.act(times[-1] + 2), expected), "held values, no time"

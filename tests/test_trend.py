@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,19 @@ import torch
 from model_helpers import SMALL, dataset, error, predictions, small_model
 from scipy.linalg import solve_discrete_are
 
-from offbeat import Dataset, InputError, Model, Stream, Trajectory, kernels, make_model
+from offbeat import (
+    Dataset,
+    InputError,
+    Model,
+    Stream,
+    Trajectory,
+    kernels,
+    load_model,
+    make_model,
+)
 from offbeat.baselines.base import padded
 from offbeat.baselines.kalman import Chains, filtered, transition
+from offbeat.errors import FileFormatError
 from offbeat.kernels import cpu
 from offbeat.kernels.spec import ScanParts, ScanSpec, StepInputs
 from offbeat.models.gains import LOOSE, Filters, tune_filters
@@ -276,6 +288,39 @@ def test_a_trend_needs_anchored_channels_and_filters() -> None:
     data = make_model("anchored_ode_gru_d", TRAIN, **SMALL).data
     with pytest.raises(InputError, match="needs a filter for each of its 3 channels"):
         Model(model.config, data)
+
+
+def with_filters_of_length(count: int, model: Model, folder: Path) -> Path:
+    """A checkpoint whose filters have another number of values."""
+    own = model.statistics
+    filters = tuple(each[:count] for each in own.filters)
+    model.statistics = replace(own, filters=filters)
+    model.save(folder)
+    model.statistics = own
+    return folder
+
+
+def test_a_file_without_errors_of_filters_has_its_vector_field_in_standard_deviations(
+    tmp_path: Path,
+) -> None:
+    model, data = small_model("anchored_trend", TRAIN), dataset(3, seed=4)
+    assert isinstance(model.field, Perceptron)
+    loaded = load_model(with_filters_of_length(4, model, tmp_path / "old"))
+    batch = model.batch(data)
+    assert not torch.equal(predictions(loaded, batch), predictions(model, batch))
+    model.field.unit = None
+    assert torch.equal(predictions(loaded, batch), predictions(model, batch))
+    stream, same = Stream(loaded), Stream(model)
+    for each in (stream, same):
+        each.observe(0.0, data[0].values[0])
+    assert np.array_equal(stream.predict(0.5), same.predict(0.5))
+
+
+def test_filters_of_another_length_are_refused_in_one_line(tmp_path: Path) -> None:
+    folder = with_filters_of_length(3, small_model("anchored_trend", TRAIN), tmp_path / "damaged")
+    with pytest.raises(FileFormatError, match=r"a filter has 5 numbers .*, got 3") as error:
+        load_model(folder)
+    assert "\n" not in str(error.value)
 
 
 def test_filters_are_tuned_on_tasks_where_nothing_is_masked() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +32,10 @@ STATE = ("state", "time", "start", "observed_at", "channel_at", "last", "updated
 """Inputs that are the state of a model; each has an output of its name with `_next`."""
 
 _NONE: dict[str, Any] = {"angles": {}, "quaternions": []}  # version 1 had no transforms
-_BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at": -np.inf}
+BEGINS = {"time": np.nan, "start": np.inf, "observed_at": -np.inf, "channel_at": -np.inf}
+"""Initial values of parts of the state, which JSON cannot hold."""
+
+Record = TypeVar("Record")
 
 
 class OnnxStream(LiveStream):
@@ -79,28 +84,9 @@ class OnnxEngine(Engine):
     """
 
     def __init__(self, path: str | Path) -> None:
-        runtime = require("onnxruntime", "export")
-        path = Path(path)
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise FileFormatError(f"{path} can't be read ({error.strerror})") from None
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        try:
-            session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-            record = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
-            self.info, self._initial = _read(record)
-            self._levels = np.array(record.get("levels", []), dtype=np.float64)
-        except FileFormatError:
-            raise
-        except Exception as error:  # onnxruntime has an exception for each kind of error
-            what = " ".join(f"{type(error).__name__}: {error}".split())
-            raise FileFormatError(
-                f"{path} is not a model that offbeat export wrote, or damaged ({what})"
-            ) from None
-        self._session, self._digest = session, hashlib.sha256(data).hexdigest()
+        opened = open_step(path, "model that offbeat export", _read)
+        self._session, self._digest = opened.session, opened.digest
+        self.info, self._initial, self._levels = opened.record
         self._unmeasured = np.full((1, len(self.info.names)), np.nan)
         self._parts = list(self._initial)
         self._next = [f"{name}_next" for name in self._parts]
@@ -164,8 +150,55 @@ class OnnxEngine(Engine):
         return self._digest
 
 
-def _read(record: Any) -> tuple[StreamInfo, Arrays]:
-    """Reads the metadata: properties of the stream, and the initial state."""
+@dataclass(frozen=True, eq=False)
+class OpenedStep(Generic[Record]):
+    """A step of an ONNX file, ready to run on one thread.
+
+    Attributes:
+        session: of onnxruntime.
+        digest: SHA-256 of the file, hexadecimal.
+        record: what was read of its metadata.
+    """
+
+    session: Any
+    digest: str
+    record: Record
+
+
+def open_step(path: str | Path, what: str, read: Callable[[Any], Record]) -> OpenedStep[Record]:
+    """Opens an ONNX file of Offbeat for one thread.
+
+    Args:
+        path: the .onnx file.
+        what: the file should hold and what writes it, such as `policy that export_policy`.
+        read: takes the JSON of its metadata; its errors mean another file.
+
+    Raises:
+        FileFormatError: the file is missing or damaged, or `read` refused it.
+        MissingExtraError: onnxruntime is not installed.
+    """
+    runtime = require("onnxruntime", "export")
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path} can't be read ({error.strerror})") from None
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    try:
+        session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        record = read(json.loads(session.get_modelmeta().custom_metadata_map[METADATA]))
+    except FileFormatError:
+        raise
+    except Exception as error:  # onnxruntime has an exception for each kind of error
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        raise FileFormatError(f"{path} is not a {what} wrote, or damaged ({why})") from None
+    return OpenedStep(session, hashlib.sha256(data).hexdigest(), record)
+
+
+def _read(record: Any) -> tuple[StreamInfo, Arrays, NDArray[np.float64]]:
+    """Reads the metadata: properties of the stream, the initial state, levels of intervals."""
     if record["format"] != FORMAT or record["version"] not in range(1, VERSION + 1):
         raise FileFormatError(
             f"the ONNX file is a {record['format']!r} of version {record['version']!r}, this "
@@ -176,7 +209,7 @@ def _read(record: Any) -> tuple[StreamInfo, Arrays]:
     if record["initial"]:  # a blend may be of baselines alone
         dtype, shapes = np.dtype(record["dtype"]), {"channel_at": (1, len(names))}
         given = {name: np.array(v, dtype=dtype) for name, v in record["initial"].items()}
-        begins = {name: np.full(shapes.get(name, (1,)), v) for name, v in _BEGINS.items()}
+        begins = {name: np.full(shapes.get(name, (1,)), v) for name, v in BEGINS.items()}
         every = {**given, **begins, "updated": np.zeros(1, dtype=bool)}
         initial = {name: every[name] for name in STATE}
     info = StreamInfo(
@@ -189,4 +222,4 @@ def _read(record: Any) -> tuple[StreamInfo, Arrays]:
         roles=tuple(record.get("roles", ())),
     )
     base = {name: np.array(v, dtype=np.float64) for name, v in record.get("base", {}).items()}
-    return info, {**initial, **base}
+    return info, {**initial, **base}, np.array(record.get("levels", []), dtype=np.float64)

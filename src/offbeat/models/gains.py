@@ -23,6 +23,7 @@ from offbeat.config import TaskConfig
 from offbeat.data.masking import masked_values
 from offbeat.data.tasks import draw_tasks
 from offbeat.data.trajectory import Dataset
+from offbeat.errors import InputError
 from offbeat.kernels import cpu
 
 TASKS = 256
@@ -125,7 +126,20 @@ class Filters:
 
     @classmethod
     def of(cls, filters: tuple[tuple[float, ...], ...]) -> Filters:
-        """From `Statistics.filters`."""
+        """From `Statistics.filters`.
+
+        Args:
+            filters: per channel clock, damping, drive, walk and error.
+
+        Raises:
+            InputError: they are not five numbers per channel.
+        """
+        wrong = {len(each) for each in filters} - {5}
+        if wrong:
+            raise InputError(
+                f"a filter has 5 numbers (clock, damping, drive, walk, error), got {min(wrong)}; "
+                "offbeat.make_model tunes them"
+            )
         table = torch.tensor(filters, dtype=torch.float64).reshape(-1, 5).t().contiguous()
         return cls(table[:4].contiguous(), table[4].clone())
 

@@ -30,7 +30,8 @@ class Statistics:
         low: per channel, smallest observed value, 0 without one; empty in checkpoints up to 0.2.
         high: per channel, largest observed value, 0 without one.
         filters: per channel, the Kalman filter that a model with a trend begins as, see
-            `models.gains.Filters`; empty for other models.
+            `models.gains.Filters`; empty for other models. Files of earlier versions lack its
+            error, and mean 1: their vector fields are in standard deviations.
     """
 
     mean: tuple[float, ...]
@@ -139,7 +140,9 @@ class Statistics:
         fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in value.items()
         }
-        fields["filters"] = tuple(tuple(each) for each in fields.get("filters", ()))
+        fields["filters"] = tuple(
+            (*each, 1.0) if len(each) == 4 else tuple(each) for each in fields.get("filters", ())
+        )
         return cls(**fields)
 
 

@@ -189,41 +189,24 @@ HEADS.register("gaussian", Gaussian)
 class Actions(Point):
     """As `Point`, with actions bounded by tanh: scaled, they lie in -1 to 1."""
 
-    acts: Tensor
-
-    def __init__(self, shape: HeadShape) -> None:
-        super().__init__(shape)
-        self.register_buffer("acts", _marked(shape), persistent=False)
-
     def decode(self, state: Tensor) -> Prediction:
         """(..., state_size) to a prediction of (..., channels)."""
-        return _bounded(super().decode(state), self.acts)
+        return _bounded(super().decode(state), self._acts)
 
 
 class GaussianActions(Gaussian):
     """As `Gaussian`, with means of actions bounded by tanh: scaled, they lie in -1 to 1."""
 
-    acts: Tensor
-
-    def __init__(self, shape: HeadShape) -> None:
-        super().__init__(shape)
-        self.register_buffer("acts", _marked(shape), persistent=False)
-
     def decode(self, state: Tensor) -> Prediction:
         """(..., state_size) to means and standard deviations of (..., channels)."""
-        return _bounded(super().decode(state), self.acts)
+        return _bounded(super().decode(state), self._acts)
 
 
-def _marked(shape: HeadShape) -> Tensor:
-    """(channels,) bool, True where the channel is an action."""
-    marked = torch.zeros(shape.channels, dtype=torch.bool)
-    marked[list(shape.actions)] = True
-    return marked
-
-
-def _bounded(prediction: Prediction, acts: Tensor) -> Prediction:
+def _bounded(prediction: Prediction, actions: Tensor) -> Prediction:
+    """The prediction with tanh of the means of some channels."""
     mean = prediction.mean
-    return Prediction(torch.where(acts, torch.tanh(mean), mean), prediction.scale)
+    chosen = torch.tanh(mean.index_select(-1, actions))
+    return Prediction(mean.index_copy(-1, actions, chosen), prediction.scale)
 
 
 HEADS.register("actions", Actions)

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from tqdm import tqdm
 
 from offbeat.config import ModelConfig, check_seed
 from offbeat.data.batch import Batch
@@ -25,6 +24,7 @@ from offbeat.models.model import Model
 from offbeat.models.zoo import MODELS, make_model
 from offbeat.parts.heads import Prediction
 from offbeat.policies.policy import Policy
+from offbeat.progress import progress_bar
 from offbeat.run import flat_parameters
 
 ACTION_HEADS = {"mse": "actions", "nll": "gaussian_actions"}
@@ -273,7 +273,7 @@ def _fit(
         parameters = stack.enter_context(flat_parameters(model))
         stack.enter_context(model.threads())
         bar = stack.enter_context(
-            tqdm(total=total, desc="cloning", unit="step", disable=None if progress else True)
+            progress_bar(total=total, desc="cloning", unit="step", show=progress)
         )
         optimizer = torch.optim.Adam([parameters.flat], lr=config.learning_rate, foreach=True)
         for epoch in range(config.epochs):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from offbeat.data.trajectory import ACTION
-from offbeat.errors import FileFormatError, InputError, require
+from offbeat.errors import InputError
 from offbeat.export.exporter import StreamStep, exportable, write_step
+from offbeat.export.runner import BEGINS, open_step
 from offbeat.policies.policy import Policy
 
 FORMAT = "offbeat-policy"
 VERSION = 1
-METADATA = "offbeat"
-
-_BEGINS: dict[str, float] = {
-    "time": np.nan,
-    "start": np.inf,
-    "observed_at": -np.inf,
-    "channel_at": -np.inf,
-}
-"""Initial values that JSON cannot hold."""
 
 
 class _PolicyStep(StreamStep):
@@ -92,7 +82,7 @@ def export_policy(policy: Policy, path: str | Path) -> None:
         "high": policy.high.tolist(),
         "initial": {
             name: [str(value.dtype).removeprefix("torch."), list(value.shape),
-                   None if name in _BEGINS else value.flatten().tolist()]
+                   None if name in BEGINS else value.flatten().tolist()]
             for name, value in initial.items()
         },
     }  # fmt: skip
@@ -111,35 +101,9 @@ class OnnxPolicy:
     """
 
     def __init__(self, path: str | Path) -> None:
-        runtime = require("onnxruntime", "export")
-        path = Path(path)
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise FileFormatError(f"{path} can't be read ({error.strerror})") from None
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        try:
-            session = runtime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-            record = json.loads(session.get_modelmeta().custom_metadata_map[METADATA])
-            if record["format"] != FORMAT or record["version"] != VERSION:
-                raise ValueError(f"it is a {record['format']!r} of version {record['version']!r}")
-            self.observations = tuple(record["observations"])
-            self.actions = tuple(record["actions"])
-            self.low, self.high = np.array(record["low"]), np.array(record["high"])
-            self._initial = {
-                name: np.full(shape, _BEGINS[name], dtype)
-                if value is None
-                else np.array(value, dtype=dtype).reshape(shape)
-                for name, (dtype, shape, value) in record["initial"].items()
-            }
-        except Exception as error:  # onnxruntime has an exception for each kind of error
-            what = " ".join(f"{type(error).__name__}: {error}".split())
-            raise FileFormatError(
-                f"{path} is not a policy that export_policy wrote, or damaged ({what})"
-            ) from None
-        self._session, self._digest = session, hashlib.sha256(data).hexdigest()
+        opened = open_step(path, "policy that export_policy", _read)
+        self._session, self._digest = opened.session, opened.digest
+        self.observations, self.actions, self.low, self.high, self._initial = opened.record
         self._parts = list(self._initial)
         self._outputs = ["action", *(f"{name}_next" for name in self._parts)]
         self.reset()
@@ -159,8 +123,10 @@ class OnnxPolicy:
             mask: (observations,) true where measured.
 
         Raises:
-            InputError: a shape is wrong.
+            InputError: a shape is wrong, or the time is not finite.
         """
+        if not np.isfinite(t):
+            raise InputError(f"t must be a finite time in seconds, got {t!r}")
         shape = (len(self.observations),)
         values = np.full(shape, np.nan) if observation is None else np.asarray(observation, float)
         seen = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
@@ -184,5 +150,28 @@ class OnnxPolicy:
 
         Args:
             state: from `state`.
+
+        Raises:
+            InputError: it is of another policy. This one has not changed then.
         """
+        shapes = {name: array.shape for name, array in self._initial.items()}
+        if {name: array.shape for name, array in state.items()} != shapes:
+            raise InputError(
+                f"the state is of another policy, expected arrays of the shapes {shapes}; give "
+                "what state() of this policy returned"
+            )
         self._state = {name: state[name].copy() for name in self._parts}
+
+
+def _read(record: Any) -> tuple[Any, ...]:
+    """Names of observations and actions, bounds, and the initial state of the metadata."""
+    if record["format"] != FORMAT or record["version"] != VERSION:
+        raise ValueError(f"it is a {record['format']!r} of version {record['version']!r}")
+    initial = {
+        name: np.full(shape, BEGINS[name], dtype)
+        if value is None
+        else np.array(value, dtype=dtype).reshape(shape)
+        for name, (dtype, shape, value) in record["initial"].items()
+    }
+    low, high = np.array(record["low"]), np.array(record["high"])
+    return tuple(record["observations"]), tuple(record["actions"]), low, high, initial

@@ -209,8 +209,15 @@ class Policy:
             self._past = replace(fresh._past, rows=int(state["rows"]), **parts)
         elif names:
             tensors: dict[str, Any] = {k: torch.tensor(v) for k, v in names.items()}
-            if tensors["values"].shape[2] != self.model.channels:
-                raise InputError("the state is of a model with other channels")
+            wrong = set(_ROWS) ^ names.keys()
+            if wrong:
+                raise InputError(f"the state is of another model: it differs in {sorted(wrong)}")
+            channels = tensors["values"].shape[-1]
+            if channels != self.model.channels:
+                raise InputError(
+                    f"the state is of a model of {channels} channels, expected "
+                    f"{self.model.channels}; give a state of this policy"
+                )
             self._past = Batch(**tensors, roles=self.model.roles)
         else:
             self._past = None

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from offbeat.config import check_seed
 from offbeat.errors import InputError
+from offbeat.progress import progress_bar
 
 if TYPE_CHECKING:
     from offbeat.env import UnevenObservations
@@ -125,7 +125,7 @@ def rollout(
     seen = [one.reset(seed=seed + i)[0] for i, one in enumerate(envs)]
     running, arrived, asked = np.ones(episodes, dtype=bool), 0, 0
     returns, count = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
-    with tqdm(desc="rollout", unit="step", disable=None if progress else True) as bar:
+    with progress_bar(total=steps, desc="rollout", unit="step", show=progress) as bar:
         while running.any():
             rows = {
                 k: np.stack([one[k] for one in seen]) for k in ("now", "time", "values", "mask")
