@@ -242,6 +242,7 @@ for name, options in (("anchored_trend", {}), ("gru", {"head": "gaussian"})):
     stream = ob.Stream(model)
     stream.observe(0.0, [0.1, 0.2])
     stream.predict(0.1)
+from offbeat.policies import Policy
 assert main(["doctor"]) == 0
 assert main(["models"]) == 2
 """

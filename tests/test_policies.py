@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import offbeat as ob
+from examples.policies.pendulum import expert as pendulum_expert
 from offbeat.data.drops import Drops
 from offbeat.data.trajectory import ACTION
 from offbeat.parts import Prediction
@@ -390,15 +391,6 @@ def test_drops_take_what_they_say_and_never_the_first_frame():
         Drops(1.0)
 
 
-def pendulum_expert(observation):
-    """Pumps energy, then balances; see examples/policies/pendulum.py."""
-    cosine, sine, speed = np.moveaxis(np.asarray(observation, dtype=float), -1, 0)
-    lacking = 5.0 - (speed**2 / 6 + 5.0 * cosine)
-    pump = 2.0 * np.where(speed >= 0, 1.0, -1.0) * np.clip(2 * lacking, -1, 1)
-    balance = -15.0 * np.arctan2(sine, cosine) - 3.7 * speed
-    return np.where((cosine > 0.85) & (abs(speed) < 4), balance, pump).clip(-2, 2)[..., None]
-
-
 class Random:
     """Acts at random."""
 
@@ -412,23 +404,36 @@ class Random:
 def test_a_small_cloning_beats_random_and_held_values_under_drops(held_model):
     pytest.importorskip("gymnasium")
     names = ("cosine", "sine", "speed")
-    shown = demonstrate(pendulum_expert, "Pendulum-v1", 40, seed=100, noise=0.3, names=names)
+    shown = demonstrate(pendulum_expert, "Pendulum-v1", 40, seed=3000, noise=0.3, names=names)
     assert shown.names == (*names, "action_0")
-    assert shown.meta["mean_return"] > -300
-    common = {"bounds": ([-2.0], [2.0]), "progress": False}
-    config = CloneConfig(epochs=100, window=40)
-    policy = fit_policy(shown, "ode_rnn", drops=Drops(frames=0.9), config=config,
-                        decoder_units=(32,), **common)  # fmt: skip
-    # The rival is trained with the same drops: on complete observations it is weaker.
-    held = fit_policy(shown, held_model, drops=Drops(frames=0.9), config=config, width=64, **common)
-    test = {"episodes": 24, "seed": 7, "drop": 0.7}
-    returns = {
-        name: rollout(one, "Pendulum-v1", **test).returns.mean()
-        for name, one in {"policy": policy, "held": held, "random": Random()}.items()
+    common = {
+        "bounds": ([-2.0], [2.0]),
+        "progress": False,
+        "drops": Drops(frames=0.9),
+        "config": CloneConfig(epochs=100, window=40),
     }
-    assert returns["random"] < -900
-    assert returns["policy"] > 0.4 * returns["random"]
-    assert returns["policy"] > returns["held"] + 30
+    policy = fit_policy(shown, "ode_rnn", decoder_units=(32,), **common)
+    # The rival is trained with the same drops: on complete observations it is weaker.
+    held = fit_policy(shown, held_model, width=64, **common)
+    starts = {"episodes": 24, "seed": 7000}
+    expert, random = (
+        rollout(one, "Pendulum-v1", **starts).returns.mean()
+        for one in (HeldController(pendulum_expert), Random())
+    )
+    # 0 is random, 100 the expert that sees everything. Settings and bounds were set before these
+    # starts and demonstrations were used: three larger trainings of docs/policies.md have 102 with
+    # 70 % of the frames lost, and 73 against 34 of the last value with 90 %.
+    scores = {
+        (name, drop): 100
+        * (rollout(one, "Pendulum-v1", **starts, drop=drop).returns - random)
+        / (expert - random)
+        for name, one in {"policy": policy, "held": held}.items()
+        for drop in (0.7, 0.9)
+    }
+    lead = scores["policy", 0.9] - scores["held", 0.9]  # the same starts and losses, in pairs
+    assert scores["policy", 0.7].mean() > 90
+    assert lead.mean() > 20
+    assert lead.mean() > 2 * lead.std(ddof=1) / np.sqrt(len(lead))
 
 
 def test_the_python_of_the_policies_page_runs(tmp_path, monkeypatch, capsys):
