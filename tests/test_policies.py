@@ -229,6 +229,8 @@ def test_the_onnx_file_acts_as_the_policy(name, tmp_path):
         other.restore({"state": np.zeros((1, 1))})
     with pytest.raises(ob.InputError, match="t must be a finite time"):
         other.act(np.nan)
+    with pytest.raises(ob.InputError, match="times must not decrease"):
+        other.act(times[-1] - 1.0)
     assert np.allclose(other.act(times[-1] + 0.2), policy.act(times[-1] + 0.2), atol=1e-9)
 
 
@@ -290,7 +292,7 @@ def test_a_wrong_option_of_a_cloning_says_what_was_expected(change, message):
     ("change", "message"),
     [
         ({"loss": "mae"}, "unknown loss of actions 'mae'"),
-        ({"epochs": 0}, "epochs must be an integer"),
+        ({"epochs": 0}, "epochs must be an integer of at least 1, got 0"),
         ({"window": 1}, "window must be at least 2 rows"),
         ({"learning_rate": -1.0}, "learning_rate must be a positive"),
         ({"observation_weight": -1.0}, "observation_weight must be at least 0"),
@@ -476,3 +478,12 @@ def test_what_a_rollout_cannot_do_is_said():
         rollout(HeldController(lambda seen: np.zeros((len(seen), 2))), "Pendulum-v1", 2)
     with pytest.raises(ob.InputError, match="recorded in time"):
         demonstrate(pendulum_expert, "Pendulum-v1", 1, delay_s=0.1)
+    for wrong, message in (
+        ({"episodes": 0}, "episodes must be an integer of at least 1, got 0"),
+        ({"noise": -0.1}, "noise must be a number of at least 0, got -0.1"),
+        ({"random_actions": 1.5}, "random_actions must be a fraction of 0 to 1, got 1.5"),
+    ):
+        with pytest.raises(ob.InputError, match=message):
+            demonstrate(pendulum_expert, "Pendulum-v1", **wrong)
+    with pytest.raises(ob.InputError, match="steps must be an integer of at least 1, got 0"):
+        rollout(held, "Pendulum-v1", 1, steps=0)

@@ -50,6 +50,12 @@ def test_a_log_becomes_a_policy_that_acts_in_an_environment(log, tmp_path, capsy
     assert 0.1 < said["observed"] < 0.7
 
 
+def test_at_least_one_demonstration_is_trained_on(log, tmp_path, capsys):
+    arguments = ["--actions=[torque]", "--validation=0.99", *CLONE]
+    assert main(["clone", str(log), str(tmp_path / "policy"), *arguments]) == 0
+    assert json.loads(capsys.readouterr().out)["demonstrations"] == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -461,6 +461,21 @@ class Recipe:
         return self.tasks is not None or self.loss == "relative"
 
 
+def check_count(name: str, value: int) -> int:
+    """A number of things, checked.
+
+    Args:
+        name: of the argument.
+        value: given.
+
+    Raises:
+        InputError: it is no integer of at least 1.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InputError(f"{name} must be an integer of at least 1, got {value!r}")
+    return value
+
+
 def check_seed(seed: int) -> int:
     """Checks and returns a seed.
 

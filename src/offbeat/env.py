@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.drops import Outages, check_fraction, check_seconds
-from offbeat.errors import InputError, MissingExtraError, require
+from offbeat.errors import InputError, require
 
 gymnasium: Any = require("gymnasium", "robots")
 
@@ -214,32 +214,8 @@ class UnevenObservations(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArg
         }
 
 
-def make(name: str) -> Any:
-    """An environment of Gymnasium by its name.
-
-    Args:
-        name: such as `Hopper-v5`.
-
-    Raises:
-        InputError: there is none of this name.
-        MissingExtraError: a package that it needs is not installed.
-    """
-    try:
-        return gymnasium.make(name)
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise MissingExtraError(
-            f"the environment {name!r} needs a package that is not installed "
-            f"({' '.join(str(error).split())}); install it with: pip install 'offbeat[robots]'"
-        ) from None
-    except gymnasium.error.Error as error:
-        what = " ".join(str(error).split())
-        raise InputError(
-            f"Gymnasium has no environment {name!r} ({what}); give a name such as Hopper-v5"
-        ) from None
-
-
 def time_step(env: Any) -> float:
-    """S per step of an environment.
+    """Length of a step of an environment, in s.
 
     Args:
         env: that has `dt`, as of MuJoCo and Pendulum, or `tau`, as of CartPole.

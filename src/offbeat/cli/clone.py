@@ -63,7 +63,9 @@ def clone_command(
     if (low is None) != (high is None):
         raise InputError("low and high bound the actions together; give both, or neither")
     if not 0 <= validation < 1:
-        raise InputError(f"validation must be a fraction of at least 0 and below 1: {validation!r}")
+        raise InputError(
+            f"validation must be a fraction of at least 0 and below 1, got {validation!r}"
+        )
     config = CloneConfig(
         loss=loss,  # type: ignore[arg-type]  # it is checked there
         epochs=epochs,
@@ -82,7 +84,7 @@ def clone_command(
         roles = tuple(ACTION if name in actions else STATE for name in dataset.names)
         dataset = Dataset(tuple(replace(t, roles=roles) for t in dataset), dataset.meta)
     order = np.random.default_rng(seed).permutation(len(dataset))
-    held = round(validation * len(dataset))
+    held = min(round(validation * len(dataset)), len(dataset) - 1)
     policy = fit_policy(
         dataset.take(order[held:]),
         model,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError, InputError, one_of, require
+from offbeat.errors import FileFormatError, InputError, MissingExtraError, one_of, require
 from offbeat.registry import Registry
 
 Draw = Callable[[np.random.RandomState, Any, int], NDArray[np.float64]]
@@ -188,6 +188,31 @@ def inside_joint_ranges(speed: float, *, turned: bool = True) -> Draw:
     return draw
 
 
+def gymnasium_env(name: str) -> Any:
+    """An environment of Gymnasium by its name.
+
+    Args:
+        name: such as `Hopper-v5`.
+
+    Raises:
+        InputError: there is none of this name.
+        MissingExtraError: gymnasium, or a package that the environment needs, is not installed.
+    """
+    gymnasium = require("gymnasium", "robots")
+    try:
+        return gymnasium.make(name)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise MissingExtraError(
+            f"the environment {name!r} needs a package that is not installed "
+            f"({' '.join(str(error).split())}); install it with: pip install 'offbeat[robots]'"
+        ) from None
+    except gymnasium.error.Error as error:
+        what = " ".join(str(error).split())
+        raise InputError(
+            f"Gymnasium has no environment {name!r} ({what}); give a name such as Hopper-v5"
+        ) from None
+
+
 def gymnasium_robot(name: str) -> Robot:
     """A robot of Gymnasium's MuJoCo environments; its initial states are those of `reset`.
 
@@ -198,12 +223,7 @@ def gymnasium_robot(name: str) -> Robot:
         InputError: there is none of this name, or it is not one of MuJoCo.
         MissingExtraError: gymnasium is not installed.
     """
-    gymnasium = require("gymnasium", "robots")
-    try:
-        env = gymnasium.make(name).unwrapped
-    except gymnasium.error.Error as error:
-        what = " ".join(str(error).split())
-        raise InputError(f"Gymnasium has no robot {name!r} ({what})") from None
+    env = gymnasium_env(name).unwrapped
     if not hasattr(env, "model") or not hasattr(env, "init_qpos"):
         raise InputError(
             f"{name!r} is no robot of MuJoCo, so there is nothing to simulate; give one such as "
@@ -320,10 +340,8 @@ def sensors_of(model: Any, names: Sequence[str]) -> tuple[list[int], list[str], 
     Raises:
         InputError: the model has no such sensor.
     """
-    kinds, there = (
-        require("mujoco", "sim").mjtSensor,
-        [model.sensor(i).name for i in range(model.nsensor)],
-    )
+    kinds = require("mujoco", "sim").mjtSensor
+    there = [model.sensor(i).name for i in range(model.nsensor)]
     index: list[int] = []
     channels, units = [], []
     for name in names:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.config import check_seed
+from offbeat.config import check_count, check_seed
 from offbeat.data.arrays import hand_over
 from offbeat.data.trajectory import ACTION, STATE, Dataset, Trajectory
 from offbeat.errors import InputError
@@ -54,6 +55,11 @@ def demonstrate(
         MissingExtraError: gymnasium is not installed.
     """
     check_seed(seed)
+    check_count("episodes", episodes)
+    if not 0 <= noise < math.inf:
+        raise InputError(f"noise must be a number of at least 0, got {noise!r}")
+    if not 0 <= random_actions <= 1:
+        raise InputError(f"random_actions must be a fraction of 0 to 1, got {random_actions!r}")
     if uneven.get("delay_s") or uneven.get("jitter_s"):
         raise InputError("a demonstration is recorded in time; leave delay_s and jitter_s out")
     made = uneven_env(env, **uneven)

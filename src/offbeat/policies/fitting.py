@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from offbeat.config import ModelConfig, check_seed
+from offbeat.config import ModelConfig, check_count, check_seed
 from offbeat.data.batch import Batch
 from offbeat.data.drops import Drops
 from offbeat.data.scaler import Scaler
@@ -64,15 +64,16 @@ class CloneConfig:
         one_of("loss of actions", self.loss, ACTION_HEADS)
         check_seed(self.seed)
         for name in ("epochs", "batch_size"):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 1):
-                raise InputError(f"{name} must be an integer of at least 1")
+            check_count(name, getattr(self, name))
         if self.window is not None and not (isinstance(self.window, int) and self.window >= 2):
             raise InputError(f"window must be at least 2 rows, got {self.window!r}")
         for name in ("learning_rate", "clip_norm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be a positive number, got {getattr(self, name)!r}")
         if not 0 <= self.observation_weight < math.inf:
-            raise InputError(f"observation_weight must be at least 0: {self.observation_weight!r}")
+            raise InputError(
+                f"observation_weight must be at least 0, got {self.observation_weight!r}"
+            )
 
 
 @dataclass(frozen=True)

@@ -123,10 +123,15 @@ class OnnxPolicy:
             mask: (observations,) true where measured.
 
         Raises:
-            InputError: a shape is wrong, or the time is not finite.
+            InputError: a shape is wrong, or the time is not finite or before the last one.
         """
         if not np.isfinite(t):
             raise InputError(f"t must be a finite time in seconds, got {t!r}")
+        last = float(self._state["time"][0])  # NaN before the first
+        if t < last:
+            raise InputError(
+                f"times must not decrease, got {t!r} s after {last!r} s; reset() begins an episode"
+            )
         shape = (len(self.observations),)
         values = np.full(shape, np.nan) if observation is None else np.asarray(observation, float)
         seen = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.config import check_seed
+from offbeat.config import check_count, check_seed
+from offbeat.data.robots import gymnasium_env
 from offbeat.errors import InputError
 from offbeat.progress import progress_bar
 
@@ -113,11 +114,13 @@ def rollout(
         Returns and lengths of the episodes.
 
     Raises:
-        InputError: the actions of the environment are no `Box`, or the controller gives others.
+        InputError: the actions of the environment are no `Box`, the controller gives others, or an
+            argument is out of its range.
         MissingExtraError: gymnasium is not installed.
     """
-    if isinstance(episodes, bool) or not isinstance(episodes, int) or episodes < 1:
-        raise InputError(f"episodes must be an integer of at least 1, got {episodes!r}")
+    check_count("episodes", episodes)
+    if steps is not None:
+        check_count("steps", steps)
     check_seed(seed)
     envs = [uneven_env(env, **uneven) for _ in range(episodes)]
     space = action_space(envs[0])
@@ -165,9 +168,9 @@ def uneven_env(env: str | Callable[[], Any], **uneven: Any) -> UnevenObservation
         InputError: Gymnasium knows no such environment.
         MissingExtraError: gymnasium, or what the environment needs, is not installed.
     """
-    from offbeat.env import UnevenObservations, make
+    from offbeat.env import UnevenObservations
 
-    made = make(env) if isinstance(env, str) else env()
+    made = gymnasium_env(env) if isinstance(env, str) else env()
     if isinstance(made, UnevenObservations):
         if uneven:
             raise InputError("the environment is uneven already; give what is lost once")
