@@ -139,6 +139,20 @@ def test_a_file_that_is_no_mjcf_is_refused(tmp_path):
         quiet(str(tmp_path / "none.xml"))
 
 
+def test_what_the_compiler_warns_of_is_said_and_not_written_to_a_file(
+    tmp_path, monkeypatch, caplog
+):
+    monkeypatch.chdir(tmp_path)
+    scaled = CART.replace("<option", '<compiler settotalmass="1"/><option')
+    (tmp_path / "cart.xml").write_text(scaled)
+    before = sorted(tmp_path.iterdir())
+    quiet(tmp_path / "cart.xml", 1, 2)
+    assert sorted(tmp_path.iterdir()) == before
+    if tuple(map(int, mujoco.__version__.split(".")[:2])) >= (3, 17):
+        assert "cart.xml: " in caplog.text
+        assert "settotalmass" in caplog.text
+
+
 @pytest.mark.parametrize("robot", sorted(ROBOTS))
 class TestEveryRobot:
     def test_has_a_channel_with_a_unit_per_position_and_velocity(self, robot):
@@ -191,7 +205,8 @@ class TestEveryRobot:
 
 
 @pytest.mark.parametrize("robot", ["hopper", "walker", "cheetah", "humanoid"])
-def test_the_models_are_those_of_the_control_suite_in_all_that_moves(robot):
+def test_the_models_are_those_of_the_control_suite_in_all_that_moves(robot, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs what it warns of
     spec = importlib.util.find_spec("dm_control")
     if spec is None:
         pytest.skip("dm_control is not installed")
@@ -320,7 +335,7 @@ def test_robots_of_gymnasium_start_as_their_environments_do():
         assert np.allclose(trajectory.values[4], then, atol=1e-12)
     with pytest.raises(InputError, match="no robot of MuJoCo"):
         quiet("CartPole-v1", 1)
-    with pytest.raises(InputError, match="Gymnasium has no robot 'Hoper-v5'"):
+    with pytest.raises(InputError, match="Gymnasium has no environment 'Hoper-v5'"):
         quiet("Hoper-v5", 1)
 
 

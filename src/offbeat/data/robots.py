@@ -7,8 +7,10 @@ arXiv:1801.00690) in the same version of MuJoCo. Their files are our own: the su
 from __future__ import annotations
 
 import copy
+import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,11 +131,31 @@ def load_model(robot: str | Path | Robot) -> Any:
         return source()
     path = require_file(source)
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        with collected_warnings(mujoco) as warnings:
+            model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise FileFormatError(
             f"{path} cannot be compiled as MJCF ({' '.join(str(error).split())})"
         ) from None
+    for warning in warnings:
+        logging.getLogger("offbeat").warning("%s: %s", path, warning)
+    return model
+
+
+@contextmanager
+def collected_warnings(mujoco: Any) -> Iterator[list[str]]:
+    """Collects MuJoCo's warnings, which otherwise go to a log file in the working directory.
+
+    Args:
+        mujoco: the module.
+    """
+    before = mujoco.get_mju_user_warning()
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield warnings
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _box(*sides: tuple[int, float, float]) -> Draw:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from offbeat.data.robots import (
     Control,
     Robot,
     channels_of,
+    collected_warnings,
     controls_of,
     load_model,
     quaternions_of,
@@ -164,7 +165,7 @@ def _roll_out(
     values[:, 0, :width] = states
     chunk = max(threads, _ROWS_PER_CHUNK // rows)
     with (
-        _collected_warnings(mujoco) as warnings,
+        collected_warnings(mujoco) as warnings,
         rollout.Rollout(nthread=threads if threads > 1 else 0) as pool,
         progress_bar(total=len(states), desc=robot, unit=" trajectories", show=progress) as bar,
     ):
@@ -198,7 +199,7 @@ def _step(
     values = np.empty((len(states), rows, width + len(sensed)))
     acted = np.empty((len(states), rows, model.nu))
     stepped = np.empty((1, rows, 1 + width))
-    with _collected_warnings(mujoco) as warnings:
+    with collected_warnings(mujoco) as warnings:
         rows_of = range(len(states))
         for i in progress_bar(rows_of, desc=robot, unit=" trajectories", show=progress):
             data = mujoco.MjData(model)
@@ -261,18 +262,6 @@ def _check_stable(
             f"{row + 1}{reason}; start it from smaller velocities, or from positions inside the "
             "joint ranges"
         )
-
-
-@contextmanager
-def _collected_warnings(mujoco: Any) -> Iterator[list[str]]:
-    """Collects MuJoCo's warnings, which otherwise go to a log file in the working directory."""
-    before = mujoco.get_mju_user_warning()
-    warnings: list[str] = []
-    mujoco.set_mju_user_warning(warnings.append)
-    try:
-        yield warnings
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _at_least(name: str, value: int, low: int) -> int:
