@@ -15,12 +15,18 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import timedelta
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
 import torch.distributed as dist
+
+# Optimizers import this module, whose default arguments would keep a group that is there already:
+# its threads would outlive it, and may abort the process when it ends.
+import torch.distributed.nn.functional
 from torch import Tensor
 
+from offbeat.devices import device_of
 from offbeat.errors import InputError, OffbeatError
 
 T = TypeVar("T")
@@ -73,8 +79,7 @@ class Ranks:
         loss = torch.where(count > 0, loss.detach().to(gradient), 0.0)
         own = torch.cat([gradient * count, (loss * count)[None], count[None]])
         every = [torch.empty_like(own) for _ in range(self.size)]
-        with self._reached():
-            dist.all_gather(every, own)
+        self._reach(partial(dist.all_gather, every, own))
         total = every[0]
         for other in every[1:]:
             total = total + other
@@ -97,22 +102,28 @@ class Ranks:
                 box[0] = function()
             except OffbeatError as error:
                 box[1] = error
-        with self._reached():
-            dist.broadcast_object_list(box, src=0)
+        self._reach(partial(dist.broadcast_object_list, box, src=0))
         if box[1] is not None:
             raise box[1]
         return box[0]  # type: ignore[no-any-return]
 
-    @contextmanager
-    def _reached(self) -> Iterator[None]:
+    def _reach(self, call: Callable[[], Any]) -> None:
+        """Calls what needs all ranks."""
         try:
-            yield
+            call()
+            return
         except RuntimeError as error:
-            why = " ".join(str(error).split())[:120]
-            raise LostRankError(
-                f"a rank was lost, as rank {self.rank} of {self.size} sees it ({why}); the same "
-                "command continues from the last checkpoint, with any number of ranks"
-            ) from None
+            why = _line(error)
+        # After the handler: the frames of the error would keep the group and its threads, too.
+        raise LostRankError(
+            f"a rank was lost, as rank {self.rank} of {self.size} sees it ({why}); the same "
+            "command continues from the last checkpoint, with any number of ranks"
+        )
+
+
+def _line(error: Exception) -> str:
+    """The begin of a message, in one line."""
+    return " ".join(str(error).split())[:120]
 
 
 _current: ContextVar[Ranks | None] = ContextVar("offbeat_ranks", default=None)
@@ -137,7 +148,7 @@ def on_first(function: Callable[[], T]) -> T:
 
 def launched() -> bool:
     """Whether `torchrun`, or a launcher with its variables, started several ranks."""
-    return int(os.environ.get("WORLD_SIZE") or 1) > 1 and "RANK" in os.environ
+    return os.environ.get("WORLD_SIZE", "1") not in ("", "1") and "RANK" in os.environ
 
 
 def device_here(device: str) -> str:
@@ -145,10 +156,15 @@ def device_here(device: str) -> str:
 
     Args:
         device: that all ranks were given.
+
+    Raises:
+        InputError: it is `auto` for several ranks, which might choose differently.
     """
-    if device == "cuda" and launched():
-        return f"cuda:{os.environ.get('LOCAL_RANK', 0)}"
-    return device
+    if not launched():
+        return device
+    if device == "auto":
+        raise InputError("several ranks need one kind of device, got 'auto'; give cpu or cuda")
+    return f"cuda:{os.environ.get('LOCAL_RANK', 0)}" if device == "cuda" else device
 
 
 @contextmanager
@@ -163,7 +179,8 @@ def group(device: str = "cpu", *, timeout_s: float = TIMEOUT_S) -> Iterator[Rank
         The ranks; None where there is one process alone.
 
     Raises:
-        InputError: the variables of `torchrun` are not complete.
+        InputError: the variables of `torchrun` are not complete, or there is no such device here.
+        LostRankError: another rank does not answer at the start.
 
     Example:
         >>> from offbeat.distributed import group
@@ -173,15 +190,21 @@ def group(device: str = "cpu", *, timeout_s: float = TIMEOUT_S) -> Iterator[Rank
     if not launched():
         yield None
         return
-    cuda = device.startswith("cuda")
-    if cuda:
-        torch.cuda.set_device(device_here(device))
+    here = device_of(device_here(device))
+    if here.type == "cuda":
+        torch.cuda.set_device(here)
+    backend = "nccl" if here.type == "cuda" else "gloo"
     try:
-        dist.init_process_group("nccl" if cuda else "gloo", timeout=timedelta(seconds=timeout_s))
+        dist.init_process_group(backend, timeout=timedelta(seconds=timeout_s))
     except ValueError as error:
         raise InputError(
             f"WORLD_SIZE is set, but the ranks can't be connected ({error}); start them with "
             "torchrun, or unset it"
+        ) from None
+    except dist.DistError as error:
+        raise LostRankError(
+            f"rank {os.environ['RANK']} of {os.environ['WORLD_SIZE']} can't reach the others "
+            f"({_line(error)}); start all of them, with one MASTER_ADDR and MASTER_PORT"
         ) from None
     ranks = Ranks(dist.get_rank(), dist.get_world_size())
     token = _current.set(ranks)

@@ -7,7 +7,6 @@ backend (C++) and the triton backend (CUDA) run the named parts faster.
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from offbeat.kernels import cpu, reference
@@ -18,7 +17,6 @@ from offbeat.kernels.backends import (
     Choice,
     choose,
     register_backend,
-    selected,
     use,
 )
 from offbeat.kernels.spec import (
@@ -130,12 +128,6 @@ def _cpu_perceptron(
     return cpu.perceptron(layers, x, activation, variant)
 
 
-def _triton_supports(spec: ScanSpec, dtype: torch.dtype, device: torch.device) -> str | None:
-    if device.type == "cpu" and selected()[0] != "triton":
-        return "the state is on the CPU, where kernels are interpreted and only run if selected"
-    return triton_backend.supports(spec, dtype, device)
-
-
 def _triton_scan(
     spec: ScanSpec,
     parts: ScanParts,
@@ -154,7 +146,7 @@ register_backend(Backend(REFERENCE, lambda spec, dtype, device: None, _reference
 register_backend(
     Backend(
         "triton",
-        _triton_supports,
+        triton_backend.supports,
         _triton_scan,
         available=lambda: () if triton_backend.why_not() else ("triton",),
         why_not=lambda: triton_backend.why_not(),
