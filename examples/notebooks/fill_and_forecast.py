@@ -41,6 +41,8 @@ for i, (name, unit) in enumerate(zip(new.names, new.units, strict=True)):
     print(f"{name}: RMSE {error:.3g} {unit} in dropouts, {held:.0f} % in the interval of 90 %")
 
 # %% [markdown]
+# Nearly all values lie in the intervals of 90 %, so here they are wider than they should be.
+#
 # A forecast is for any time after the last row. `beyond` would mark answers for longer times than
 # were trained.
 
