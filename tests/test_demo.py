@@ -106,6 +106,19 @@ def test_hidden_values_are_those_that_a_log_without_dropouts_would_have():
     assert np.std(error) == pytest.approx(arm_log.NOISE["joints"][0], rel=0.5)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"seconds": 0.5}, "seconds must be a length of at least 1 s, got 0.5"),
+        ({"dropout_fraction": 1.0}, "dropout_fraction must be a fraction"),
+        ({"outage_s": -1.0}, "outage_s must be seconds of at least 0"),
+    ],
+)
+def test_a_log_of_the_arm_that_cannot_be_made_is_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
+        arm_log.recorded(**wrong)
+
+
 def test_both_animations_show_every_row_and_the_second_hides_its_latter_half(made):
     blue = []
     for name in ("hopper.gif", "hopper_extrapolation.gif"):

@@ -11,6 +11,7 @@ Journal of Neuroscience 5(7)) with pauses in which the gripper closes on an obje
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.config import check_seed
+from offbeat.data.drops import check_fraction, check_seconds
 from offbeat.data.trajectory import Trajectory
+from offbeat.errors import InputError
 from offbeat.files import write_text
 
 Array = NDArray[np.float64]
@@ -251,7 +255,15 @@ def measured(
 
     Returns:
         By sensor.
+
+    Raises:
+        InputError: the log is shorter than 1 s, or an argument is out of its range.
     """
+    if not 1 <= seconds < math.inf:
+        raise InputError(f"seconds must be a length of at least 1 s, got {seconds!r}")
+    check_seed(seed)
+    check_fraction("dropout_fraction", dropout_fraction)
+    check_seconds("outage_s", outage_s)
     moved = motion(seconds, seed)
     random = np.random.default_rng([seed, 1])
     outage = random.uniform(0.3, 0.5) * seconds
@@ -282,6 +294,9 @@ def recorded(seconds: float = 240.0, **options: Any) -> tuple[Array, dict[str, A
 
     Returns:
         (rows,) s and (rows, channels) per sensor, NaN where it does not report.
+
+    Raises:
+        InputError: as `measured`.
     """
     found = measured(seconds, **options)
     times = np.unique(np.concatenate([each.times[~each.silent] for each in found.values()]))
@@ -299,6 +314,12 @@ def with_hidden_values(seconds: float = 240.0, **options: Any) -> Trajectory:
     Args:
         seconds: length.
         options: as of `measured`.
+
+    Returns:
+        26 channels in their units; hidden values are finite, and not observed.
+
+    Raises:
+        InputError: as `measured`.
     """
     found = measured(seconds, **options)
     times = np.unique(np.concatenate([each.times for each in found.values()]))
@@ -331,6 +352,9 @@ def write(
         seconds: length of the log.
         seed: as of `recorded`.
         outage_s: as of `recorded`.
+
+    Raises:
+        InputError: as `measured`.
     """
     times, table = recorded(seconds, seed=seed, outage_s=outage_s)
     header = ["time [s]", *(name for sensor in table for name in CHANNELS[sensor])]

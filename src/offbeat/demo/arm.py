@@ -104,6 +104,12 @@ def learn_arm(out: Path, training: TrainConfig, *, seconds: float, progress: boo
         training: its length, and the seed of weights and tasks.
         seconds: length of the log.
         progress: show progress bars.
+
+    Returns:
+        The run of `models/arm`, with its blend.
+
+    Raises:
+        InputError: the log is too short, or the folder holds another run.
     """
     path = out / "arm.csv"
     write(path, seconds)
@@ -141,6 +147,9 @@ def answer_arm(
         seconds: that it took.
         trained_s: s, length of the log.
         progress: show the time of long steps.
+
+    Returns:
+        Scores of fills and forecasts, in standard deviations.
     """
     new = with_hidden_values(_NEW_S, seed=1, outage_s=0.0)
     with busy("filling and forecasting another recording", progress):

@@ -96,6 +96,13 @@ def train_hopper(
         epochs: of the training.
         seed: of windows, masks, split, weights and batches.
         progress: show progress bars.
+
+    Returns:
+        The model, and its training.
+
+    Raises:
+        InputError: a number is out of its range, or the folder holds another run.
+        MissingExtraError: mujoco is not installed.
     """
     recorded = simulate(ROBOT, n_trajectories, 2 * ROWS, seed=seed, progress=progress)
     masked = mask_out(windows(recorded, ROWS, seed=seed), OBSERVED_FRACTION, seed=seed)
@@ -118,6 +125,9 @@ def compare_hopper(
         fitted: its training.
         n_new: trajectories to score.
         progress: show progress bars.
+
+    Returns:
+        Errors of all models in the units of the thesis.
     """
     recorded = simulate(ROBOT, n_new, 2 * ROWS, seed=NEW_SEED, progress=progress)
     new = mask_out(windows(recorded, ROWS, seed=NEW_SEED), OBSERVED_FRACTION, seed=NEW_SEED)
