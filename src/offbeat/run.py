@@ -342,7 +342,7 @@ _WORDS = {
     "model": "the options of the model",
     "training": "the options of the training",
     "scaler": "the scales of the channels",
-    "statistics": "the means, scales or gaps of the training set",
+    "statistics": "the means, scales, gaps or filters of the training set",
     "initial_weights": "the initial weights",
     "train": "the trajectories of the training set",
     "validation": "the trajectories of the validation set",
