@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import io
-import time
 import tokenize
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -62,18 +61,6 @@ class Peer:
         """Lines of code of the function, and of those of its module that it needs."""
         module, _, name = self.function.partition(":")
         return code_lines(Path(__file__).with_name(f"{module}.py").read_text("utf-8"), name)
-
-
-def busy(seconds: float = 1.0) -> float:
-    """Wall seconds for a second of CPU time on this machine now, for peers that count the former.
-
-    Args:
-        seconds: of CPU time, to find out.
-    """
-    wall, cpu = time.perf_counter(), time.process_time()
-    while time.process_time() < cpu + seconds:
-        pass
-    return (time.perf_counter() - wall) / seconds
 
 
 FILL, FORECAST = "fill", "forecast"

@@ -104,9 +104,11 @@ def run(
 
 def _work(peer: str, inputs: Path, out: Path, options: Options, python: str) -> str:
     """Runs the worker; returns the last line of its error, or an empty text."""
+    # The worker has a folder of its own; the link of an environment's interpreter is not followed.
+    place = os.path.abspath(python) if os.path.dirname(python) else python
     command = [
-        python if PEERS[peer].elsewhere else sys.executable,
-        *("-m", "benchmarks.peers", "answer", "--peer", peer, "--inputs", str(inputs)),
+        place if PEERS[peer].elsewhere else sys.executable,
+        *("-m", "benchmarks.peers", "answer", "--peer", peer, "--inputs", str(inputs.resolve())),
         *("--out", str(out), "--seed", str(options.seed), "--budget_s", str(options.budget_s)),
     ]
     if options.checkout is not None:
