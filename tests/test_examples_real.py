@@ -334,6 +334,74 @@ def test_the_document_has_the_tables_between_its_markers(ran):
         report.document(text, "g1", "body")
 
 
+@pytest.fixture
+def doctored(ran, tmp_path):
+    """Results in which Offbeat has other errors and coverage than it had."""
+
+    def made(errors, coverage):
+        found = json.loads((ran[0] / "lasa" / "quick_seed0.json").read_text())
+        for name, each in found["predictors"].items():
+            for task, scores in each["scores"]["test"].items():
+                scores["rmse_scaled"] = errors.get((name, task), errors.get(name, 2.0))
+                if "coverage" in scores:
+                    nominal = {level: float(level) for level in scores["coverage"]}
+                    scores["coverage"] = nominal | coverage.get((name, task), {})
+        path = tmp_path / "seed0.json"
+        path.write_text(json.dumps(found))
+        return results.Summary([path])
+
+    return made
+
+
+def test_every_loss_to_a_baseline_is_stated_with_its_size(doctored):
+    summary = doctored(
+        {
+            "ridge": 1.0,
+            "pchip": 0.5,
+            "offbeat": 1.02,  # a tie
+            ("offbeat", "forecast 1 s"): 1.3,
+            "offbeat_two_sided": 0.4,
+            ("offbeat_two_sided", "fill 0.5 s"): 0.6,
+        },
+        {},
+    )
+    said = report.losses(summary, "test").splitlines()
+    assert "- Offbeat: forecast 1 s 1.3 (ridge)" in said
+    assert "- Offbeat (both sides): fill 0.5 s 1.2 (PCHIP)" in said
+    assert said[0].startswith("Losses by more than 2 %")
+    assert len(said) == 2 + 6, "a line per predictor of Offbeat"
+
+
+def test_intervals_that_are_off_are_counted_with_the_worst(doctored):
+    summary = doctored(
+        {},
+        {
+            ("offbeat", "one step"): {"0.5": 0.45, "0.8": 0.772},
+            ("offbeat", "forecast 1 s"): {"0.5": 0.65, "0.95": 0.9},
+        },
+    )
+    said = report.misses(summary, "test").splitlines()
+    assert (
+        "- Offbeat, of 21: too narrow in 2, most by 5 (one step, 50 %); "
+        "too wide in 1, most by 15 (forecast 1 s, 50 %)"
+    ) in said
+    assert "- Offbeat (both sides), of 6: none" in said
+
+
+def test_the_front_page_marks_the_best_baseline_though_it_has_no_column(doctored):
+    errors = {"mean": 0.7, "ridge": 0.9, "offbeat": 0.8, "offbeat_two_sided": 0.1}
+    ahead, fill = report.front_page([doctored(errors, {})]).splitlines()[2:]
+    assert ahead.endswith("| 2 | 2 | 2 | 0.9 | **0.7**, mean | 0.8 |")
+    assert fill.endswith("| 0.7, mean | **0.1** |")
+
+
+def test_the_tables_have_all_seeds_whatever_was_run_now(ran, capsys):
+    out, asked = ran
+    assert [p.stem for p in results.files_of(out, "lasa", True)] == ["quick_seed0", "quick_seed1"]
+    main([*asked[:3], "--out", str(out)])
+    assert "±" in capsys.readouterr().out
+
+
 def test_what_is_there_is_not_run_again(ran, capsys):
     out, asked = ran
     path = out / "lasa" / "quick_seed0.json"

@@ -141,7 +141,9 @@ def kernel_ridge(problem: Problem, options: Options) -> Answerer:
         tried = []
         for gamma in (0.3, 3.0):
             kernels = Nystroem(
-                gamma=gamma / x.shape[1], n_components=300, random_state=options.seed
+                gamma=gamma / x.shape[1],
+                n_components=min(300, len(x)),
+                random_state=options.seed,
             )
             mapped, held_mapped = kernels.fit_transform(x), kernels.transform(held[0])
             both, held_both = np.hstack([x, mapped]), np.hstack([held[0], held_mapped])

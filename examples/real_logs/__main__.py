@@ -12,7 +12,7 @@ from . import report
 from .figures import draw_calibration
 from .logs import LOGS, MissingLogError
 from .predictors import PREDICTORS
-from .results import Summary, path_of, run
+from .results import Summary, files_of, run
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     parser = argparse.ArgumentParser(prog="python -m examples.real_logs", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/real_logs"))
-    parser.add_argument("--seeds", type=int, default=1, help="how many, from 0 on")
+    parser.add_argument("--seeds", type=int, default=1, help="how many, from 0 on, to run")
     parser.add_argument("--log", action="append", choices=LOGS, help="by default all; repeat it")
     parser.add_argument(
         "--predictor", action="append", choices=PREDICTORS, help="by default all; repeat it"
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 again=options.again,
                 figures=options.figures,
             )
-        files = [path_of(options.out, name, seed, options.quick) for seed in range(options.seeds)]
+        files = files_of(options.out, name, options.quick)
         summary = Summary(files)
         body = report.tables(summary)
         if "offbeat" in summary.predictors and len(summary.tasks(summary.tests[0])) > 1:

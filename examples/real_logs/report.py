@@ -10,7 +10,7 @@ from offbeat.errors import InputError
 
 from .predictors import ORACLE, ORACLE_TWO_SIDED
 from .results import Intervals, Summary
-from .scores import Against
+from .scores import BAND, Against
 
 
 def document(text: str, name: str, body: str) -> str:
@@ -57,7 +57,8 @@ def front_page(summaries: Sequence[Summary]) -> str:
     Args:
         summaries: of the logs that have results of Offbeat.
     """
-    head = ["", "last value", "constant velocity, or PCHIP", "Kalman", "ridge", "Offbeat"]
+    head = ["", "last value", "constant velocity, or PCHIP", "Kalman", "ridge"]
+    head += ["best baseline, in hindsight", "Offbeat"]
     rows = []
     for task, columns in FRONT_PAGE.items():
         for summary in summaries:
@@ -75,11 +76,32 @@ def front_page(summaries: Sequence[Summary]) -> str:
                     )
                     for names in columns
                 ]
+                name, lowest = _best(summary, test, task, columns[-1][0])
+                errors.insert(-1, lowest)
                 best = np.nanmin(errors)
                 shown = ["" if np.isnan(e) else f"{e:.3g}" for e in errors]
                 bold = [f"**{t}**" if e == best else t for t, e in zip(shown, errors, strict=True)]
+                bold[-2] += f", {_words(name)}"
                 rows.append([f"{task}: {title}", *bold])
     return _table(head, rows)
+
+
+def _best(summary: Summary, test: str, task: str, like: str) -> tuple[str, float]:
+    """The baseline of the lowest error among those with the input of a predictor; its error."""
+    errors = {
+        name: _mean(each)
+        for name in _baselines(summary, like)
+        if (each := summary.scaled(test, task, name))
+    }
+    name = min(errors, key=lambda name: errors[name])
+    return name, errors[name]
+
+
+def _baselines(summary: Summary, like: str) -> list[str]:
+    """Baselines with the input of a predictor: the past, or both sides as well."""
+    causal = summary.causal(like)
+    every = [name for name in summary.predictors if not name.startswith(PRODUCT)]
+    return [name for name in every if summary.causal(name) or not causal]
 
 
 def tables(summary: Summary, *, every: bool = False) -> str:
@@ -92,7 +114,7 @@ def tables(summary: Summary, *, every: bool = False) -> str:
     parts = []
     for test in summary.tests:
         title = f"{test.capitalize()}: " if len(summary.tests) > 1 else ""
-        parts += [f"{title}RMSE, scaled", errors(summary, test)]
+        parts += [f"{title}RMSE, scaled", errors(summary, test), losses(summary, test)]
         if every:
             parts += [f"{title}RMSE in units", groups(summary, test)]
         parts += [
@@ -104,8 +126,9 @@ def tables(summary: Summary, *, every: bool = False) -> str:
             parts += [
                 f"{title}coverage of 50 / 80 / 95 % intervals; CRPS{more}, scaled",
                 calibrated,
+                misses(summary, test),
             ]
-    return "\n\n".join(parts)
+    return "\n\n".join(part for part in parts if part)
 
 
 def errors(summary: Summary, test: str) -> str:
@@ -136,6 +159,61 @@ def errors(summary: Summary, test: str) -> str:
     return _table(["", *asked], rows)
 
 
+def losses(summary: Summary, test: str) -> str:
+    """A line per predictor of Offbeat: tasks in which it loses to the best baseline by over 2 %.
+
+    Args:
+        summary: of the log.
+        test: name of the test part.
+
+    Returns:
+        Ratios of the errors over all channels, means over seeds; empty without Offbeat.
+    """
+    lines = []
+    for name in (name for name in summary.predictors if name.startswith(PRODUCT)):
+        lost = []
+        for task in summary.tasks(test):
+            each = summary.scaled(test, task, name)
+            if not each:
+                continue
+            baseline, lowest = _best(summary, test, task, name)
+            if _mean(each) > (1 + BAND) * lowest:
+                lost.append(f"{task} {_mean(each) / lowest:.3g} ({_words(baseline)})")
+        lines.append(f"- {_label(summary, name)}: {', '.join(lost) or 'none'}")
+    head = f"Losses by more than {100 * BAND:.0f} % over all channels, as multiples of the error of"
+    return "\n".join([f"{head} the best baseline:", "", *lines]) if lines else ""
+
+
+def misses(summary: Summary, test: str) -> str:
+    """A line per predictor with intervals: how often they are off by more than 3 points.
+
+    Args:
+        summary: of the log.
+        test: name of the test part.
+    """
+    lines = []
+    for name in summary.predictors:
+        off = {
+            f"{task}, {100 * float(level):.0f} %": 100 * (covered - float(level))
+            for task in summary.tasks(test)
+            if (found := summary.intervals(test, task, name))
+            for level, covered in found.coverage.items()
+            if level in SHOWN_LEVELS
+        }
+        if not off:
+            continue
+        narrow = {each: -points for each, points in off.items() if points < -OFF}
+        wide = {each: points for each, points in off.items() if points > OFF}
+        said = []
+        for word, found in (("narrow", narrow), ("wide", wide)):
+            if found:
+                worst = max(found, key=lambda each: found[each])
+                said.append(f"too {word} in {len(found)}, most by {found[worst]:.0f} ({worst})")
+        lines.append(f"- {_label(summary, name)}, of {len(off)}: {'; '.join(said) or 'none'}")
+    head = f"Intervals whose coverage is off by more than {OFF:.0f} points:"
+    return "\n".join([head, "", *lines])
+
+
 def groups(summary: Summary, test: str) -> str:
     """As `errors`, in the units of groups of channels: a row per group and predictor."""
     asked = summary.tasks(test)
@@ -156,6 +234,13 @@ KINDS = ("one step", "fill", "forecast")
 
 PRODUCT = "offbeat"
 """Names of the predictors that are not baselines start with it."""
+
+
+OFF = 3.0
+"""Points of coverage by which an interval may be off."""
+
+SHOWN_LEVELS = ("0.5", "0.8", "0.95")
+"""Levels of intervals in the tables, as in the files."""
 
 
 def shown(summary: Summary, test: str) -> list[str]:
@@ -193,8 +278,7 @@ def against(
     if simple:
         others = list(ORACLE if causal else ORACLE_TWO_SIDED)
     else:
-        baselines = [n for n in summary.predictors if not n.startswith(PRODUCT)]
-        others = [n for n in baselines if summary.causal(n) or not causal]
+        others = _baselines(summary, name)
     ratios = {task: summary.ratios(test, task, name, others) for task in summary.tasks(test)}
     found = [
         np.concatenate([np.empty(0), *(r for task, r in ratios.items() if task.startswith(kind))])
@@ -263,16 +347,20 @@ def _has_score(summary: Summary, test: str) -> bool:
 def _calibration(found: Intervals | None) -> str:
     if found is None:
         return ""
-    covered = " / ".join(f"{100 * found.coverage[level]:.0f}" for level in ("0.5", "0.8", "0.95"))
+    covered = " / ".join(f"{100 * found.coverage[level]:.0f}" for level in SHOWN_LEVELS)
     score = f"; {_number(found.score['0.95'])}" if found.score else ""
     return f"{covered}; {_number(found.crps)}{score}"
 
 
 def _label(summary: Summary, name: str) -> str:
+    return _words(name) if summary.causal(name) else f"{_words(name)} (both sides)"
+
+
+def _words(name: str) -> str:
     words = name.removesuffix("_two_sided").replace("_", " ")
     for word, proper in (("pchip", "PCHIP"), ("offbeat", "Offbeat"), ("kalman", "Kalman")):
         words = words.replace(word, proper)
-    return words if summary.causal(name) else f"{words} (both sides)"
+    return words
 
 
 def _mean(each: Sequence[float]) -> float:

@@ -31,6 +31,13 @@ def path_of(out: Path, log: str, seed: int, quick: bool) -> Path:
     return out / log / f"{'quick_' if quick else ''}seed{seed}.json"
 
 
+def files_of(out: Path, log: str, quick: bool) -> list[Path]:
+    """The files of a log, in the order of their seeds."""
+    start = path_of(out, log, 0, quick).name.removesuffix("0.json")
+    found = out.joinpath(log).glob(f"{start}*.json")
+    return sorted(found, key=lambda path: int(path.stem.removeprefix(start)))
+
+
 def run(
     log: Log,
     out: Path,
