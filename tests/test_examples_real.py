@@ -341,11 +341,11 @@ def doctored(ran, tmp_path):
     def made(errors, coverage):
         found = json.loads((ran[0] / "lasa" / "quick_seed0.json").read_text())
         for name, each in found["predictors"].items():
-            for task, scores in each["scores"]["test"].items():
-                scores["rmse_scaled"] = errors.get((name, task), errors.get(name, 2.0))
-                if "coverage" in scores:
-                    nominal = {level: float(level) for level in scores["coverage"]}
-                    scores["coverage"] = nominal | coverage.get((name, task), {})
+            for task, scored in each["scores"]["test"].items():
+                scored["rmse_scaled"] = errors.get((name, task), errors.get(name, 2.0))
+                if "coverage" in scored:
+                    nominal = {level: float(level) for level in scored["coverage"]}
+                    scored["coverage"] = nominal | coverage.get((name, task), {})
         path = tmp_path / "seed0.json"
         path.write_text(json.dumps(found))
         return results.Summary([path])

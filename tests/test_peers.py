@@ -218,10 +218,8 @@ def test_a_run_takes_relative_paths(made, tmp_path, monkeypatch):
     place.symlink_to(sys.executable)
     python = os.path.relpath(place)
     monkeypatch.setitem(PEERS, "last_value", replace(PEERS["last_value"], elsewhere=True))
-    main(
-        ["run", "--log", "lasa", "--peer", "last_value", "--tasks", tasks_at]
-        + ["--python", python, "--out", str(tmp_path / "out")]
-    )
+    places = ["--tasks", tasks_at, "--python", python, "--out", str(tmp_path / "out")]
+    main(["run", "--log", "lasa", "--peer", "last_value", *places])
     found = json.loads((tmp_path / "out" / "lasa" / "last_value.json").read_text())
     assert "error" not in found
     assert found["scores"]["fill 0.5 s"]["rmse_scaled"] > 0

@@ -205,10 +205,10 @@ def misses(summary: Summary, test: str) -> str:
         narrow = {each: -points for each, points in off.items() if points < -OFF}
         wide = {each: points for each, points in off.items() if points > OFF}
         said = []
-        for word, found in (("narrow", narrow), ("wide", wide)):
-            if found:
-                worst = max(found, key=lambda each: found[each])
-                said.append(f"too {word} in {len(found)}, most by {found[worst]:.0f} ({worst})")
+        for word, missed in (("narrow", narrow), ("wide", wide)):
+            if missed:
+                worst = max(missed, key=lambda each: missed[each])
+                said.append(f"too {word} in {len(missed)}, most by {missed[worst]:.0f} ({worst})")
         lines.append(f"- {_label(summary, name)}, of {len(off)}: {'; '.join(said) or 'none'}")
     head = f"Intervals whose coverage is off by more than {OFF:.0f} points:"
     return "\n".join([head, "", *lines])
@@ -275,10 +275,8 @@ def against(
         By kind of task in the order of `KINDS`, and over all; None where nothing can be compared.
     """
     causal = summary.causal(name)
-    if simple:
-        others = list(ORACLE if causal else ORACLE_TWO_SIDED)
-    else:
-        others = _baselines(summary, name)
+    oracle = ORACLE if causal else ORACLE_TWO_SIDED
+    others = oracle if simple else _baselines(summary, name)
     ratios = {task: summary.ratios(test, task, name, others) for task in summary.tasks(test)}
     found = [
         np.concatenate([np.empty(0), *(r for task, r in ratios.items() if task.startswith(kind))])
