@@ -302,8 +302,20 @@ def test_answers_are_laid_out_as_the_truth_is(made):
 # --- the table ------------------------------------------------------------------------------------
 
 
-def test_the_document_has_what_the_results_say():
-    """Of every result that is committed, the numbers in the document are those of its file."""
-    out, document = results.ROOT / "results" / "peers", table.DOCUMENT
+@pytest.mark.parametrize("document", table.DOCUMENTS, ids=lambda path: path.name)
+def test_the_documents_have_what_the_results_say(document):
+    """Of every result that is committed, the numbers in a document are those of its file."""
     text = document.read_text(encoding="utf-8")
-    assert table.fill_in(text, out) == text
+    assert table.fill_in(text, results.ROOT / "results" / "peers") == text
+
+
+def test_ratios_are_to_the_best_other_peer_and_losses_are_bold(tmp_path):
+    errors = {"offbeat": (0.9, 1.2), "ridge": (1.0, 1.5), "kernel_ridge": (2.0, 1.0)}
+    for peer, (fill, ahead) in errors.items():
+        scores = {"fill 0.5 s": {"rmse_scaled": fill}, "forecast 1 s": {"rmse_scaled": ahead}}
+        path = results.path_of(tmp_path, "lasa", peer, 0)
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps({"scores": scores}))
+    head, _, row = table.ratios(tmp_path).splitlines()
+    assert head == "|  | fill | forecast 1 s |"
+    assert row == "| lasa | 0.90 scikit-learn ridge | **1.20** scikit-learn kernel ridge |"

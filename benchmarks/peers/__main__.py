@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     tasks = commands.add_parser("tasks", help="write what is hidden and asked, once")
     run = commands.add_parser("run", help="run the pairs of log and peer that have no result yet")
-    table = commands.add_parser("table", help="write the results into the document")
+    table = commands.add_parser("table", help="write the results into the documents")
     answer = commands.add_parser("answer", help="one peer, in this process; `run` calls it")
     for each in (tasks, run):
         each.add_argument("--log", action="append", choices=LOG_NAMES, help="by default all")
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     answer.add_argument("--peer", choices=PEERS, required=True)
     answer.add_argument("--inputs", type=Path, required=True)
     answer.add_argument("--out", type=Path, required=True)
-    table.add_argument("--document", type=Path, default=Path("docs/benchmarks_peers.md"))
+    table.add_argument("--document", type=Path, action="append", help="by default both pages")
     given = parser.parse_args(arguments)
     globals()[f"_{given.command}"](given)
 
@@ -83,11 +83,10 @@ def _answer(given: argparse.Namespace) -> None:
 
 
 def _table(given: argparse.Namespace) -> None:
-    from .table import fill_in
+    from .table import DOCUMENTS, fill_in
 
-    given.document.write_text(
-        fill_in(given.document.read_text(encoding="utf-8"), given.out), encoding="utf-8"
-    )
+    for page in given.document or DOCUMENTS:
+        page.write_text(fill_in(page.read_text(encoding="utf-8"), given.out), encoding="utf-8")
 
 
 def _options(given: argparse.Namespace) -> Options:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from .registry import PEERS
 LOGS = ("g1", "lasa", "wrist", "hopper")
 """In the order of the summary."""
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "benchmarks_peers.md"
+_ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = _ROOT / "docs" / "benchmarks_peers.md", _ROOT / "README.md"
 
 
 def fill_in(text: str, out: Path) -> str:
@@ -26,7 +28,7 @@ def fill_in(text: str, out: Path) -> str:
 
     def found(match: re.Match[str]) -> str:
         name = match.group(1)
-        whole = {"settings": settings, "summary": summary}
+        whole = {"settings": settings, "summary": summary, "peers": ratios}
         body = whole[name](out) if name in whole else rows(name, out)
         return f"<!-- {name} -->\n\n{body}\n\n<!-- end of {name} -->"
 
@@ -66,13 +68,31 @@ def rows(log: str, out: Path) -> str:
     return "\n".join(lines)
 
 
-def summary(out: Path) -> str:
-    """The table of Offbeat beside the best peer of each task.
+@dataclass(frozen=True)
+class Beside:
+    """Offbeat beside the best other peer of a task, chosen in hindsight.
+
+    Attributes:
+        log: name.
+        task: name.
+        ours: RMSE of Offbeat, scaled.
+        theirs: that of the other peer.
+        peer: its name.
+    """
+
+    log: str
+    task: str
+    ours: float
+    theirs: float
+    peer: str
+
+
+def beside(out: Path) -> Iterator[Beside]:
+    """Every task that Offbeat was asked, in the order of the logs.
 
     Args:
         out: folder of the results.
     """
-    lines = [_line(["", "", "Offbeat", "best of the others", "which", "ratio"]), _line(["---"] * 6)]
     for log in (log for log in LOGS if log in _logs(out)):
         found = dict(results_of(log, out))
         own = found.pop("offbeat", {}).get("scores", {})
@@ -83,12 +103,45 @@ def summary(out: Path) -> str:
                 if _has(result, task)
             }
             best = min(others, key=lambda name: others[name])
-            ours, theirs = scores["rmse_scaled"], others[best]
-            shown = [
-                f"**{v:.3g}**" if v == min(ours, theirs) else f"{v:.3g}" for v in (ours, theirs)
-            ]
-            lines.append(_line([log, task, *shown, PEERS[best].title, f"{ours / theirs:.2f}"]))
+            yield Beside(log, task, scores["rmse_scaled"], others[best], best)
+
+
+def summary(out: Path) -> str:
+    """The table of Offbeat beside the best peer of each task.
+
+    Args:
+        out: folder of the results.
+    """
+    lines = [_line(["", "", "Offbeat", "best of the others", "which", "ratio"]), _line(["---"] * 6)]
+    for each in beside(out):
+        both = each.ours, each.theirs
+        shown = [f"**{v:.3g}**" if v == min(both) else f"{v:.3g}" for v in both]
+        ratio = f"{each.ours / each.theirs:.2f}"
+        lines.append(_line([each.log, each.task, *shown, PEERS[each.peer].title, ratio]))
     return "\n".join(lines)
+
+
+def ratios(out: Path) -> str:
+    """A row per log for the first page: ratios of `summary`, those of losses in bold, and peers.
+
+    Args:
+        out: folder of the results.
+    """
+    found = list(beside(out))
+    tasks = list(dict.fromkeys(_kind(each) for each in found))
+    lines = [_line(["", *tasks]), _line(["---"] * (len(tasks) + 1))]
+    for log in dict.fromkeys(each.log for each in found):
+        cells = dict.fromkeys(tasks, "")
+        for each in (each for each in found if each.log == log):
+            ratio = f"{each.ours / each.theirs:.2f}"
+            shown = f"**{ratio}**" if each.ours > each.theirs else ratio
+            cells[_kind(each)] = f"{shown} {PEERS[each.peer].title}"
+        lines.append(_line([log, *cells.values()]))
+    return "\n".join(lines)
+
+
+def _kind(each: Beside) -> str:
+    return "fill" if each.task.startswith("fill") else each.task
 
 
 def settings(out: Path) -> str:
