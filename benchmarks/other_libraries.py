@@ -120,11 +120,9 @@ def torch_library(*, torchdiffeq: bool) -> SimpleNamespace:
     def by_library(field: Any, y: Any, gap: Any) -> Any:
         from torchdiffeq import odeint
 
-        if float(gap[0, 0]) == 0:
-            return y
-        # torchdiffeq takes one time grid for the batch; here all gaps of a row are equal.
-        times = torch.stack([torch.zeros(()), gap[0, 0]])
-        return odeint(lambda _, state: field(state), y, times, method="euler")[-1]
+        # torchdiffeq takes one time grid for the batch: from 0 to 1, in units of each gap.
+        times = torch.tensor([0.0, 1.0])
+        return odeint(lambda _, state: gap * field(state), y, times, method="euler")[-1]
 
     def loop(step: Any, state: Any, rows: dict[str, Any]) -> Any:
         outputs = []

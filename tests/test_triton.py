@@ -211,7 +211,7 @@ def test_tiles_cover_every_shape_of_the_benchmark():
 
 
 def test_compiled_kernels_fit_into_shared_memory_and_registers():
-    """The larger of the two kernels, with all parts; hidden units change only lengths of loops.
+    """The larger of the two kernels, with all parts, at one width.
 
     `python -m offbeat.kernels.triton.offline` compiles every shape of the benchmark.
     """

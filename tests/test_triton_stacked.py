@@ -62,6 +62,23 @@ def test_models_that_are_trained_together_end_where_each_ends_alone(name, monkey
     assert not torch.equal(first, second)
 
 
+def test_a_rival_of_the_benchmark_has_our_loss_where_first_observations_differ(monkeypatch):
+    pytest.importorskip("torchdiffeq")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    from common import synthetic
+    from other_libraries import TorchStep, inputs_of
+
+    data = synthetic(4, 5, observed_fraction=0.5)
+    options = {**SMALL, "nodes": "rows", "bounded": False}
+    model = ob.make_model("anchored_ode_gru_d", data, **options).float()
+    batch = model.batch(data)
+    rows = model.step_inputs(batch)[0]
+    assert (rows.gap.amax(dim=0) > rows.gap.amin(dim=0)).any()
+    expected = float(Examples(model, batch).loss(model, torch.arange(len(data)), None).detach())
+    step = TorchStep(model, inputs_of(rows, batch.values))
+    assert step() == pytest.approx(expected, rel=1e-5)
+
+
 def test_models_of_other_shapes_are_refused():
     models, examples, states, recipe = runs(1)
     others, more, their_states, _ = runs(1, "rnn")
@@ -69,6 +86,12 @@ def test_models_of_other_shapes_are_refused():
         StackedModels(models + others, examples + more, states + their_states, recipe)
     with pytest.raises(InputError, match="got 0 models"):
         StackedModels([], [], [], recipe)
+    models, examples, states, recipe = runs(2)
+    together = StackedModels(models, examples, states, recipe)
+    with pytest.raises(InputError, match="got 1 batches for 2 models"):
+        together.step([torch.tensor([0])])
+    with pytest.raises(InputError, match="have 1 x 3, 2 x 3 trajectories x rows"):
+        together.step([torch.tensor([0]), torch.tensor([0, 1])])
 
 
 @pytest.mark.skipif(not backend.interpreted(), reason="Triton would need a GPU")

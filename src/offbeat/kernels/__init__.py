@@ -135,9 +135,7 @@ def _triton_scan(
     state: Tensor,
     variant: str | None,
 ) -> tuple[Tensor, Tensor] | None:
-    if triton_backend.unsupported(parts, inputs, state):
-        return None
-    if state.device.type != "cpu" and triton_backend.distrusted(spec, parts, inputs, state):
+    if triton_backend.refused(spec, parts, inputs, state):
         return None
     return triton_backend.scan(spec, parts, inputs, state)
 

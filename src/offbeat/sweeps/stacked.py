@@ -65,15 +65,23 @@ class StackedModels:
 
         Returns:
             (runs,) the losses before the step.
+
+        Raises:
+            InputError: the batches differ in trajectories or rows.
         """
+        if len(indices) != len(self.models):
+            raise InputError(f"got {len(indices)} batches for {len(self.models)} models")
         taken = [e.prepared.take(i).gathered() for e, i in zip(self.examples, indices, strict=True)]
+        sizes = [f"{len(one)} x {one.rows}" for one in taken]
+        if len(set(sizes)) > 1:
+            raise InputError(
+                f"the batches have {', '.join(sizes)} trajectories x rows; give each model as many"
+            )
         first = [m.first_state(len(t)) for m, t in zip(self.models, taken, strict=True)]
         spec, parts = self.models[0].spec, [model.scan_parts() for model in self.models]
         choice = choose(spec, first[0].dtype, first[0].device)
-        together = choice.backend.name == "triton"
-        if together and first[0].device.type != "cpu":
-            together = not triton_backend.distrusted(spec, parts[0], taken[0], first[0])
-        if together:
+        triton = choice.backend.name == "triton"
+        if triton and not triton_backend.refused(spec, parts[0], taken[0], first[0]):
             found = triton_backend.scan_stacked(spec, parts, taken, torch.stack(first))
             each = list(zip(*found, strict=True))
         else:

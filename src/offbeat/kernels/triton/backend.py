@@ -144,6 +144,19 @@ def distrusted(
     return _trusted[key]
 
 
+def refused(
+    spec: ScanSpec, parts: ScanParts, inputs: StepInputs | TableSteps, state: Tensor
+) -> str:
+    """The reason why a scan of a supported spec does not run in this backend, else "".
+
+    On the CPU, where kernels are interpreted, results are not compared.
+    """
+    reason = unsupported(parts, inputs, state)
+    if reason or state.device.type == "cpu":
+        return reason or ""
+    return distrusted(spec, parts, inputs, state)
+
+
 def disagreement(spec: ScanSpec, parts: ScanParts, inputs: StepInputs, state: Tensor) -> float:
     """The largest difference from the reference backend in states and gradients.
 
