@@ -519,7 +519,7 @@ def test_an_outage_of_one_sensor_is_another_kind_than_one_of_all():
     assert (widths[usual + MOTIONS, 0, 9] < widths[usual, 0, 9]).all()
 
 
-def test_kinds_of_before_outages_were_told_apart_are_read(blend):
+def test_blends_saved_before_outages_had_kinds_of_their_own_are_read(blend):
     old = dict(blend.stack.arrays())
     kinds = len(blend.stack.keys.bins) * MOTIONS + 1
     old["weights"] = old["weights"][:kinds]

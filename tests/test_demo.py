@@ -199,3 +199,5 @@ def test_labels_of_lines_that_end_together_do_not_cover_each_other():
     assert min(np.diff(heights)) > 0.05 * (high - low)
     with pytest.raises(InputError, match="give 2 errors"):
         by_elapsed([5, 10], {"gru": [1.0]})
+    with pytest.raises(InputError, match=r"an error of 0\.0, expected errors above 0"):
+        by_elapsed([5, 10], {"gru": [1.0, 0.0]})

@@ -57,6 +57,10 @@ def test_the_cheap_ones_are_fitted_first_and_no_fit_ends_late(slow_world):
     assert found["ridge"].train == ["ridge"] * 12
 
 
+def test_the_cheapest_is_fitted_whatever_it_costs(slow_world):
+    assert tuple(fit_members(("ridge", "kalman_short"), *PARTS, budget_s=0.0)) == ("kalman_short",)
+
+
 def test_a_budget_that_suffices_changes_no_number():
     names = ("kalman_short", "last_value", "damped_slope")
     free, limited = (fit_members(names, *PARTS, budget_s=s) for s in (None, 1e9))

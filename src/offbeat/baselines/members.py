@@ -43,17 +43,18 @@ def fit_members(
         train: training tasks.
         validation: other tasks.
         budget_s: s; a baseline that would end later is left out, unless its cost is at most
-            `ALWAYS`. None fits all.
+            `ALWAYS` or there is no cheaper one. None fits all.
 
     Returns:
         Those that were fitted, in the order of the names.
     """
-    started, found, done = Clock(), {}, 0.0
+    found: dict[str, Member] = {}
+    started, done = Clock(), 0.0
     for name in sorted(names, key=lambda name: BASELINES[name].cost):
         cost = BASELINES[name].cost
-        if budget_s is not None and cost > ALWAYS:
+        if budget_s is not None and cost > ALWAYS and found:
             spent = Clock() - started
-            if not done or spent * (1 + cost / done) > budget_s:
+            if spent * (1 + cost / done) > budget_s:
                 continue
         baseline = fit_baseline(name, train)
         predicted = cross_fitted(name, train) if baseline.flexible else baseline.predict(train)

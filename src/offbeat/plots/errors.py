@@ -34,7 +34,11 @@ def by_task(
 
     found = [value for each in errors.values() for value in each.values()]
     if not found or not all(value > 0 and np.isfinite(value) for value in found):
-        raise InputError("give errors above 0, at least one")
+        bad = [value for value in found if not (value > 0 and np.isfinite(value))]
+        raise InputError(
+            f"got {f'an error of {bad[0]}' if bad else 'no error'}, expected one or more above 0; "
+            "leave out what cannot be drawn on a logarithmic axis"
+        )
     names = list(dict.fromkeys(name for each in errors.values() for name in each))
     with rc_context(RC):
         figure = Figure(figsize=(PAGE_WIDTH, 1.3 + 0.5 * len(errors)), layout="constrained")
@@ -91,7 +95,8 @@ def by_elapsed(
         highlighted: predictors with thicker lines.
 
     Raises:
-        InputError: there is no predictor, or one with another number of errors.
+        InputError: there is no predictor, one with another number of errors, or an error that is
+            not above 0.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -99,8 +104,17 @@ def by_elapsed(
     at = np.asarray(elapsed, dtype=np.float64)
     lines = {name: np.asarray(values, dtype=np.float64) for name, values in errors.items()}
     if not lines or any(values.shape != at.shape for values in lines.values()):
-        raise InputError(f"give {at.size} errors for each of one or more predictors")
+        got = ", ".join(f"{name}: {values.shape}" for name, values in lines.items()) or "none"
+        raise InputError(
+            f"got errors of shapes {got}; give {at.size} errors, one per time, for each of one or "
+            "more predictors"
+        )
     together = np.concatenate(list(lines.values()))
+    if not (together > 0).all():
+        raise InputError(
+            f"got an error of {together.min()}, expected errors above 0; leave out what cannot be "
+            "drawn on a logarithmic axis"
+        )
     limits = float(together.min()) / 1.15, float(together.max()) * 1.15
     with rc_context(RC):
         figure = Figure(figsize=(PAGE_WIDTH, 3.9), layout="constrained")

@@ -66,7 +66,11 @@ def spans(
     from matplotlib.figure import Figure
 
     if not columns or len(columns) != len(channels) or len({len(c) for c in channels}) != 1:
-        raise InputError("give a column or more, and the same number of channels for each")
+        counts = [len(names) for names in channels]
+        raise InputError(
+            f"got {len(columns)} columns and channels for {len(channels)} of them, {counts} each; "
+            "give a column or more, and the same number of channels for each"
+        )
     for column, names in zip(columns, channels, strict=True):
         for channel in names:
             for trajectory in (column.truth, column.answer, *column.others.values()):
