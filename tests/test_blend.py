@@ -12,7 +12,7 @@ import offbeat as ob
 from offbeat.answers.blend import fit_blend, tables_of
 from offbeat.answers.both_sides import SideMotion, Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
-from offbeat.baselines.history import AgeBins, carried
+from offbeat.baselines.history import AgeBins, filled_bins
 from offbeat.baselines.stack import LEVELS as MOTIONS
 from offbeat.baselines.stack import Stack, kinds_of
 from offbeat.baselines.weights import (
@@ -534,7 +534,7 @@ def test_bins_without_values_take_those_of_a_neighbour():
     table = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]])
     count = np.array([[0, 1], [1, 0], [0, 0], [2, 0]])
     found = [[3, 2], [3, 2], [3, 2], [7, 2]]
-    assert carried(table, count).tolist() == found
+    assert filled_bins(table, count).tolist() == found
 
 
 def test_motion_around_a_gap_is_that_of_its_neighbours_and_of_its_ends():

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
 from offbeat.baselines.base import Array, Baseline, fit_baseline
-from offbeat.baselines.history import AgeBins, carried, usual_gaps
+from offbeat.baselines.history import AgeBins, filled_bins, usual_gaps
 from offbeat.baselines.members import fit_members
 from offbeat.baselines.stack import (
     ACTIVITY,
@@ -148,7 +148,7 @@ class SideMotion:
         return cls(
             gap,
             slope / np.maximum(slopes, 1),
-            carried(rise / np.maximum(rises, 1), rises),
+            filled_bins(rise / np.maximum(rises, 1), rises),
         )
 
     def level(self, trajectory: Trajectory, sides: Sides, at: NDArray[np.int64]) -> Array:

@@ -192,7 +192,7 @@ def usual_gaps(dataset: Dataset) -> Array:
     return usual
 
 
-def carried(table: Array, count: Array) -> Array:
+def filled_bins(table: Array, count: Array) -> Array:
     """A table whose bins without values have those of the bin before, the first ones of the next.
 
     Args:

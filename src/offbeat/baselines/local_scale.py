@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from offbeat.baselines.base import Array, State, namespace, padded, stepped
-from offbeat.baselines.history import AgeBins, History, carried
+from offbeat.baselines.history import AgeBins, History, filled_bins
 from offbeat.baselines.simple import DampedSlope, as_kind
 from offbeat.data.trajectory import Dataset
 
@@ -59,7 +59,7 @@ class LocalScale:
             np.add.at(total, where, (rows.values - predicted)[counted] ** 2)
             np.add.at(count, where, 1.0)
             np.add.at(logs, where[0], np.log(np.maximum(age[counted], 1e-300)))
-        mean = carried(total / np.maximum(count, 1), count)
+        mean = filled_bins(total / np.maximum(count, 1), count)
         many = count.sum(axis=1)
         self.middle = np.where(many > 0, logs / np.maximum(many, 1), np.log(bins.middle))
         floor = 1e-12 * self.slope.scale**2

@@ -16,7 +16,7 @@ from offbeat.baselines.base import (
     padded,
     stepped,
 )
-from offbeat.baselines.history import AgeBins, History, carried
+from offbeat.baselines.history import AgeBins, History, filled_bins
 from offbeat.data.trajectory import Dataset, Trajectory
 
 
@@ -108,7 +108,7 @@ class DampedSlope(ConstantVelocity):
             np.add.at(count, where, 1.0)
         self.edges = bins.edges
         factor = np.clip(cross / np.where(square > 0, square, 1.0), 0.0, 1.5)
-        self.factor = carried(factor, count)
+        self.factor = filled_bins(factor, count)
 
     def read(self, state: State, time: Any) -> Any:
         """See `CausalBaseline`."""
