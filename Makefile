@@ -89,10 +89,17 @@ define install
 	@touch .venv/.installing
 	$(BIN)/python -m pip install -qq torch
 	$(BIN)/python -m pip install -qq --editable '.[$(1)]'
+	@echo "$(MODULES)" > .venv/.modules
 	@rm .venv/.installing
 endef
 
 SOURCES := pyproject.toml constraints.txt CMakeLists.txt $(wildcard csrc/* csrc/*/*)
+
+# An editable installation holds a list of the modules: install again where one came, went or moved.
+MODULES := $(shell find src -name '*.py' | LC_ALL=C sort | cksum)
+ifneq ($(MODULES),$(shell cat .venv/.modules 2>/dev/null))
+$(shell rm -f .venv/.sim .venv/.test)
+endif
 
 .venv/.sim: .venv/.made $(SOURCES)
 	$(call install,sim)
