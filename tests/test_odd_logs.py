@@ -266,6 +266,7 @@ def test_a_plan_is_plain_data():
         assert SplitConfig(**record["split"]) == chosen_for(name).split
 
 
+@pytest.mark.timeout(900)  # on a loaded machine
 @pytest.mark.parametrize("name", ["short", "constants", "long_dropouts", "two_episodes"])
 def test_the_printed_command_trains_and_its_run_answers(name, tmp_path, capsys):
     path = write_csv(ODD_LOGS[name](), tmp_path / "log.csv")
