@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ import offbeat as ob
 from examples.policies.pendulum import expert as pendulum_expert
 from offbeat.data.drops import Drops
 from offbeat.data.trajectory import ACTION
+from offbeat.data.transforms import Angle, Transforms
 from offbeat.parts import Prediction
 from offbeat.policies import (
     CloneConfig,
@@ -232,6 +235,61 @@ def test_the_onnx_file_acts_as_the_policy(name, tmp_path):
     with pytest.raises(ob.InputError, match="times must not decrease"):
         other.act(times[-1] - 1.0)
     assert np.allclose(other.act(times[-1] + 0.2), policy.act(times[-1] + 0.2), atol=1e-9)
+
+
+def wrapped(seed: int = 0, rows: int = 40) -> ob.Trajectory:
+    """A turning joint that is sent from -pi to pi, a quaternion of changing sign, and a push."""
+    random = np.random.default_rng(seed)
+    times = np.cumsum(random.uniform(0.02, 0.1, rows))
+    angle = 4 * times + seed
+    half = np.stack([np.cos(angle / 2), np.sin(angle / 2), 0 * angle, 0 * angle], axis=1)
+    sent = (angle + np.pi) % (2 * np.pi) - np.pi
+    half *= random.choice([-1, 1], rows)[:, None]
+    push = np.sin(angle)
+    values = np.concatenate([sent[:, None], half, push[:, None]], axis=1)
+    names = ("joint", "qw", "qx", "qy", "qz", "push")
+    return ob.Trajectory(times, values, names=names, roles=("state",) * 5 + ("action",))
+
+
+def turning() -> ob.Dataset:
+    """Turning joints whose transforms are applied, as a reader does."""
+    transforms = Transforms({"joint": Angle(2 * np.pi, -np.pi)}, (("qw", "qx", "qy", "qz"),))
+    return transforms.apply(ob.Dataset(tuple(wrapped(i) for i in range(4))))
+
+
+def test_a_policy_applies_the_input_transforms_of_its_demonstrations_row_by_row(tmp_path):
+    config = CloneConfig(epochs=1, window=20)
+    policy = fit_policy(turning(), "gru_d", config=config, progress=False, **SMALL)
+    policy.model.double()
+    asked = [wrapped(9), wrapped(11)]
+    observed = np.random.default_rng(0).random((2, 40, 6)) < 0.6
+    observed[:, 0], observed[..., 5] = True, False
+    shown = [replace(t, observed=seen) for t, seen in zip(asked, observed, strict=True)]
+    with torch.no_grad():
+        predicted = policy.model(policy.model.batch(ob.Dataset(tuple(shown)))).mean.numpy()
+    expected = policy.model.scaler.original(predicted)[..., 5]
+    policy.reset(2)
+    for row in range(40):
+        if row == 15:  # goes on in another policy
+            np.savez(tmp_path / "state.npz", **policy.state())
+            other = Policy(policy.model)
+            other.reset(2)
+            with np.load(tmp_path / "state.npz") as state:
+                other.restore(dict(state))
+            policy = other
+        given = [np.array([t.times[row] for t in asked]), [t.values[row, :5] for t in asked]]
+        chosen = policy.act(*given, observed[:, row, :5])
+        assert np.allclose(chosen[:, 0], expected[:, row], atol=1e-11)
+    with pytest.raises(ob.InputError, match="differs in 'angle'"):
+        policy.restore({k: v for k, v in policy.state().items() if k != "transforms.angle"})
+    with pytest.raises(ob.InputError, match="takes no input transforms, and 'joint' has one"):
+        export_policy(policy, tmp_path / "policy.onnx")
+
+
+def test_an_action_with_an_input_transform_is_refused():
+    pushes = Transforms({"push": Angle(2 * np.pi)}).apply(turning())
+    with pytest.raises(ob.InputError, match="the action 'push' has an input transform"):
+        fit_policy(pushes, "gru_d", progress=False, **SMALL)
 
 
 def test_a_file_that_is_no_policy_is_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Clones policies and their rivals, runs them, and writes the tables of `docs/policies.md`.
 
     python -m examples.policies --robot pendulum --seeds 3
+    python -m examples.policies --robot hopper --training "all drops" "no drops" --minutes 10
     python -m examples.policies --robot pendulum --document docs/policies.md
 
 A file per rival, training and seed is kept in `results/policies/ROBOT`; what is there is not run
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,9 @@ import numpy as np
 import torch
 
 from examples.real_logs.results import machine
+from offbeat.data.robots import gymnasium_env
 from offbeat.data.trajectory import Dataset
+from offbeat.env import UnevenObservations
 from offbeat.files import write_json
 from offbeat.policies import CloneConfig, Drops, HeldController, demonstrate, fit_policy, rollout
 
@@ -27,7 +31,12 @@ from .rivals import RIVALS, options_of
 from .robots import Robot, robots
 
 RESULTS = Path("results/policies")
-TRAININGS = {"drops": Drops(frames=0.9), "no drops": Drops(frames=0.0)}
+TRAININGS = {
+    "drops": Drops(frames=0.9),
+    "all drops": Drops(frames=0.9, sensors=0.5, bursts=0.3),
+    "no drops": Drops(frames=0.0),
+}
+FIRST_SEED = 50_000  # of the tests
 
 
 def conditions(robot: Robot) -> dict[str, dict[str, Any]]:
@@ -35,7 +44,7 @@ def conditions(robot: Robot) -> dict[str, dict[str, Any]]:
     frames = {f"{100 * d:.0f} %": {"drop": d} for d in (0.0, 0.3, 0.5, 0.7, 0.9)}
     return {
         **frames,
-        "bursts": {"bursts": 0.3, "burst_s": (2 * robot.dt, 10 * robot.dt)},
+        "bursts": {"bursts": 0.3, "burst_s": (0.1, 0.5)},
         "sensors": {"sensor_drop": 0.5},
         "delay": {"delay_s": 2 * robot.dt},
     }
@@ -56,14 +65,41 @@ class Random:
         return self.random.uniform(*self.bounds, (self.n, self.actions))
 
 
+class Again(UnevenObservations):  # type: ignore[misc]
+    """An environment whose seeds are taken modulo the number of episodes.
+
+    Args:
+        env: of Gymnasium.
+        episodes: number of different seeds.
+        **lost: as of `UnevenObservations`.
+    """
+
+    def __init__(self, env: Any, episodes: int, **lost: Any) -> None:
+        super().__init__(env, **lost)
+        self.episodes = episodes
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """Begins an episode."""
+        assert seed is not None
+        return super().reset(seed=FIRST_SEED + (seed - FIRST_SEED) % self.episodes, options=options)
+
+
 def tested(controller: Any, robot: Robot, episodes: int, steps: int | None) -> dict[str, Any]:
-    """Returns of a controller under all conditions; the same starts and losses for every one."""
-    return {
-        name: rollout(
-            controller, robot.env, episodes, seed=50_000, steps=steps, **lost
-        ).returns.tolist()
-        for name, lost in conditions(robot).items()
-    }
+    """Returns of a controller under all conditions; the same starts and losses for every one.
+
+    The episodes of all conditions run side by side.
+    """
+    asked = conditions(robot)
+    lost = iter([each for each in asked.values() for _ in range(episodes)])
+    found = rollout(
+        controller,
+        lambda: Again(gymnasium_env(robot.env), episodes, **next(lost)),
+        episodes * len(asked),
+        seed=FIRST_SEED,
+        steps=steps,
+    )
+    each = found.returns.reshape(len(asked), episodes)
+    return {name: each[i].tolist() for i, name in enumerate(asked)}
 
 
 def shown(robot: Robot) -> tuple[Dataset, Dataset]:
@@ -84,7 +120,7 @@ def main(given: list[str] | None = None) -> None:
     add = parser.add_argument
     add("--robot", default="pendulum", help=f"one of {', '.join(robots())}")
     add("--seeds", type=int, default=3, help="trainings of each rival")
-    add("--training", default="drops", choices=TRAININGS, help="what is lost in training")
+    add("--training", nargs="+", default=["drops"], choices=TRAININGS, help="what training loses")
     add("--only", default="", help="names of rivals, separated by semicolons")
     add("--episodes", type=int, default=20)
     add("--steps", type=int, help="that an episode of a test is cut off after")
@@ -108,46 +144,45 @@ def main(given: list[str] | None = None) -> None:
             write_json(folder / f"{name}.json", {"rival": f"{name}, last value", "returns": found})
     train = None
     chosen = [name.strip() for name in asked.only.split(";") if name.strip()] or list(RIVALS)
-    for seed in range(asked.seeds):
-        for name in chosen:
-            words = f"{name} {asked.training}".replace(",", "").replace(" ", "_")
-            path = folder / f"{words}-{seed}.json"
-            if path.exists():
-                continue
-            if time.monotonic() > stop:
-                return
-            if train is None:
-                train, validation = shown(robot)
-            model, options = options_of(name)
-            config = CloneConfig(epochs=robot.epochs, window=robot.window, seed=seed)
-            began = time.process_time()
-            policy = fit_policy(
-                train,
-                model,
-                validation=validation,
-                bounds=([robot.bounds[0]], [robot.bounds[1]]),
-                drops=TRAININGS[asked.training],
-                config=config,
-                progress=False,
-                **options,
-            )
-            seconds = time.process_time() - began
-            found = tested(policy, robot, asked.episodes, asked.steps)
-            write_json(
-                path,
-                {
-                    "rival": name,
-                    "training": asked.training,
-                    "seed": seed,
-                    "returns": found,
-                    "validation": min(record.validation for record in policy.log),
-                    "parameters": sum(p.numel() for p in policy.model.parameters()),
-                    "training_seconds": round(seconds, 1),
-                    "machine": machine(),
-                },
-            )
-            means = " ".join(f"{k} {np.mean(v):.0f};" for k, v in found.items())
-            print(f"{name} {asked.training} {seed}: {seconds:.0f} s, {means}", flush=True)
+    for seed, training, name in product(range(asked.seeds), asked.training, chosen):
+        words = f"{name} {training}".replace(",", "").replace(" ", "_")
+        path = folder / f"{words}-{seed}.json"
+        if path.exists():
+            continue
+        if time.monotonic() > stop:
+            return
+        if train is None:
+            train, validation = shown(robot)
+        model, options = options_of(name)
+        config = CloneConfig(epochs=robot.epochs, window=robot.window, seed=seed)
+        began = time.process_time()
+        policy = fit_policy(
+            train,
+            model,
+            validation=validation,
+            bounds=([robot.bounds[0]], [robot.bounds[1]]),
+            drops=TRAININGS[training],
+            config=config,
+            progress=False,
+            **options,
+        )
+        seconds = time.process_time() - began
+        found = tested(policy, robot, asked.episodes, asked.steps)
+        write_json(
+            path,
+            {
+                "rival": name,
+                "training": training,
+                "seed": seed,
+                "returns": found,
+                "validation": min(record.validation for record in policy.log),
+                "parameters": sum(p.numel() for p in policy.model.parameters()),
+                "training_seconds": round(seconds, 1),
+                "machine": machine(),
+            },
+        )
+        means = " ".join(f"{k} {np.mean(v):.0f};" for k, v in found.items())
+        print(f"{name} {training} {seed}: {seconds:.0f} s, {means}", flush=True)
 
 
 if __name__ == "__main__":

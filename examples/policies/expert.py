@@ -4,7 +4,8 @@
 
 ARS V2-t of Mania, Guy and Recht 2018 (arXiv:1803.07055): finite differences of the return along
 random directions, the best ones kept, observations in units of their running spread. It needs the
-simulator alone, on one core. A search that was stopped goes on where it was.
+simulator alone, on one core. A search that was stopped goes on where it was. The policy of every
+20th iteration is kept, so that there are experts of several levels of skill.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def episode(
 def search(name: str, folder: Path, minutes: float, seed: int) -> None:
     """Searches for some minutes; keeps the best policy by the mean return of 10 episodes."""
     step, directions, kept, noise = SEARCH[name]
-    env = gymnasium.make(name)
+    env = gymnasium.make(name, disable_env_checker=True)
     shape = (env.action_space.shape[0], env.observation_space.shape[0])
     policy = Linear(np.zeros(shape), np.zeros(shape[1]), np.zeros(shape[1]))
     state = {"iteration": 0, "steps": 0, "best": -np.inf, "log": []}
@@ -115,13 +116,12 @@ def search(name: str, folder: Path, minutes: float, seed: int) -> None:
             )
             state["log"].append([state["iteration"], state["steps"], score])
             print(name, state["iteration"], state["steps"], f"{score:.0f}", flush=True)
+            found = {"env": name, "return": f"{score:.1f}", "steps": str(state["steps"])}
+            tensors = {"matrix": matrix, "mean": policy.mean}
+            save_file(tensors, at / f"{state['iteration']}.safetensors", metadata=found)
             if score > state["best"]:
                 state["best"] = score
-                save_file(
-                    {"matrix": matrix, "mean": policy.mean},
-                    at / "expert.safetensors",
-                    metadata={"env": name, "return": f"{score:.1f}", "steps": str(state["steps"])},
-                )
+                save_file(tensors, at / "expert.safetensors", metadata=found)
             save_file(
                 {"weights": policy.weights, "mean": policy.mean, "squares": policy.squares},
                 at / "search.safetensors",

@@ -12,7 +12,11 @@ from scipy.stats import trim_mean
 
 from .rivals import RIVALS
 
-TITLES = {"drops": "Trained with drops", "no drops": "Trained without drops"}
+TITLES = {
+    "drops": "Trained with frames lost",
+    "all drops": "Trained with frames, sensors and bursts lost",
+    "no drops": "Trained without losses",
+}
 RESAMPLED = 2000
 
 

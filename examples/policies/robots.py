@@ -60,8 +60,12 @@ def robots() -> dict[str, Robot]:
             "Pendulum-v1", pendulum.expert, (-2.0, 2.0), 50, 0.3, 0.05, pendulum.NAMES
         )
     }
-    for name, env, dt in (("hopper", "Hopper-v5", 0.008), ("half_cheetah", "HalfCheetah-v5", 0.05)):
+    for name, env, dt in (
+        ("hopper", "Hopper-v5", 0.008),
+        ("half_cheetah", "HalfCheetah-v5", 0.05),
+        ("walker2d", "Walker2d-v5", 0.008),
+    ):
         path = HERE / f"{name}.safetensors"
         if path.exists():
-            found[name] = Robot(env, linear(path), (-1.0, 1.0), 40, 0.1, dt, epochs=40)
+            found[name] = Robot(env, linear(path), (-1.0, 1.0), 40, 0.1, dt, epochs=80)
     return found

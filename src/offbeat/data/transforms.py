@@ -136,6 +136,12 @@ class Transforms:
         """The channels that are not given to the model."""
         return (*self.constants, *self.copies, *self.ignored)
 
+    @property
+    def named(self) -> set[str]:
+        """The channels that a transform changes or leaves out."""
+        fours = {name for four in self.quaternions for name in four}
+        return {*self.angles, *fours, *self.missing, *self.left_out}
+
     @classmethod
     def identity(cls) -> Transforms:
         """Transforms that change nothing."""

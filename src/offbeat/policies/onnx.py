@@ -66,9 +66,15 @@ def export_policy(policy: Policy, path: str | Path) -> None:
         path: .onnx file, written atomically.
 
     Raises:
-        InputError: the model has no recurrent state, or an adaptive solver.
+        InputError: the model has no recurrent state, an adaptive solver, or input transforms.
         MissingExtraError: onnx or onnxscript is not installed.
     """
+    if not policy.model.transforms.is_identity:
+        raise InputError(
+            "an ONNX file of a policy takes no input transforms, and "
+            f"{min(policy.model.transforms.named)!r} has one; read the demonstrations with "
+            "unwrap=False, and give angles as sine and cosine"
+        )
     model = exportable(policy.model)
     step = _PolicyStep(policy)
     initial = step.initial()

@@ -19,6 +19,7 @@ from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_model
 from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model, depends_on_rows
+from offbeat.stream.transformed import LiveTransforms, TransformState
 
 State = dict[str, NDArray[Any]]
 """The state of a policy, by the names of its parts."""
@@ -37,7 +38,7 @@ class Policy:
         window: rows that are kept of a model without a recurrent state.
 
     Raises:
-        InputError: no channel of the model is an action, or it has input transforms.
+        InputError: no channel of the model is an action, or an action has an input transform.
 
     Example:
         >>> policy.reset()  # doctest: +SKIP
@@ -52,16 +53,18 @@ class Policy:
                 "a policy needs a model with observations and actions, got the roles "
                 f"{', '.join(model.roles)}; give channels the role 'action'"
             )
-        if not model.transforms.is_identity:
-            raise InputError(
-                "a policy takes no input transforms; read the demonstrations without them "
-                "(unwrap=False), and give angles as sine and cosine"
-            )
         self.model, self.window = model, window
         self.observations = tuple(np.array(model.names)[~acts].tolist())
         """Names of the observed channels, in order."""
         self.actions = tuple(np.array(model.names)[acts].tolist())
         """Names of the actions, in order."""
+        changed = model.transforms.named & set(self.actions)
+        if changed:
+            raise InputError(
+                f"the action {min(changed)!r} has an input transform; observations alone may have "
+                "some: read the demonstrations with unwrap=False, and leave out constant actions"
+            )
+        self._transforms = LiveTransforms(model.transforms, self.observations)
         shift, scale = model.scaler.shift[acts], np.abs(model.scaler.scale[acts])
         self.low, self.high = shift - scale, shift + scale
         """(actions,) bounds of the actions, in their units."""
@@ -85,6 +88,7 @@ class Policy:
         self.n = n
         self._newest = np.full(n or 1, -np.inf)  # s, of the newest observation
         self._asked = np.full(n or 1, -np.inf)  # s, of the newest action
+        self._sent = [self._transforms.start()] * (n or 1)
         self._past: RecurrentState | Batch | None = None
         if isinstance(self.model, Model):
             self._past = self.model.empty_state(n or 1)
@@ -114,7 +118,7 @@ class Policy:
             InputError: a shape or a name is wrong, or a time is before the one of the last call.
         """
         count = self.n or 1
-        values, seen = self._row(observation, mask)
+        values, seen, sent = self._transformed(*self._row(observation, mask))
         stamp = _times("t", t, count)
         arrived: NDArray[np.bool_] = np.asarray(seen.any(axis=1))
         asked = stamp if now is None else _times("now", now, count)
@@ -133,7 +137,7 @@ class Policy:
         if (asked > stamp).any():
             chosen, _ = self._forward(asked, np.zeros_like(values), np.zeros_like(seen))
         self._newest = np.where(arrived, stamp, self._newest)
-        self._asked = asked
+        self._asked, self._sent = asked, sent
         return chosen if self.n is not None else chosen[0]
 
     def select_action(self, batch: Mapping[str, Any]) -> Tensor:
@@ -176,6 +180,8 @@ class Policy:
                 arrays[field.name] = value.cpu().numpy().copy()
         if isinstance(past, RecurrentState):
             arrays["rows"] = np.array(past.rows)
+        for field in fields(TransformState) if not self.model.transforms.is_identity else ():
+            arrays[_SENT + field.name] = np.stack([getattr(one, field.name) for one in self._sent])
         return arrays
 
     def restore(self, state: State) -> None:
@@ -192,7 +198,9 @@ class Policy:
             raise InputError("this is no state of a policy (it has no array 'newest')")
         fresh = Policy(self.model, window=self.window)
         fresh.reset(len(newest) if self.n is not None or len(newest) > 1 else None)
-        names = {k: v for k, v in state.items() if k not in ("newest", "asked", "rows")}
+        sent = fresh._restored({k: v for k, v in state.items() if k.startswith(_SENT)})
+        others = ("newest", "asked", "rows")
+        names = {k: v for k, v in state.items() if k not in others and not k.startswith(_SENT)}
         if isinstance(fresh._past, RecurrentState):
             expected = {
                 f.name: getattr(fresh._past, f.name)
@@ -222,6 +230,7 @@ class Policy:
         else:
             self._past = None
         self.n, self._newest, self._asked = fresh.n, newest.copy(), asked.copy()
+        self._sent = sent
 
     def save(self, path: str | Path) -> None:
         """Writes the policy to a folder, atomically, as a checkpoint of its model.
@@ -274,6 +283,36 @@ class Policy:
             seen &= given.astype(bool)
         return np.where(seen, values, 0.0).reshape(shape), seen.reshape(shape)
 
+    def _transformed(
+        self, values: NDArray[np.float64], seen: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_], list[TransformState]]:
+        """(n, observations) as the model takes them, and what the transforms keep of each robot."""
+        if self.model.transforms.is_identity:
+            return values, seen, self._sent
+        rows = zip(values, seen, self._sent, strict=True)
+        found = [self._transforms.apply(row, mask, sent) for row, mask, sent in rows]
+        mask = np.stack([each[1] for each in found])
+        return (
+            np.where(mask, np.stack([each[0] for each in found]), 0.0),
+            mask,
+            [each[2] for each in found],
+        )
+
+    def _restored(self, arrays: State) -> list[TransformState]:
+        """What the transforms keep of each robot, from `state`."""
+        if self.model.transforms.is_identity and not arrays:
+            return self._sent
+        kept = {}
+        for field in fields(TransformState):
+            value, like = arrays.get(_SENT + field.name), getattr(self._sent[0], field.name)
+            if value is None or value.shape != (len(self._sent), *like.shape):
+                raise InputError(f"the state is of another model: it differs in {field.name!r}")
+            kept[field.name] = value.astype(like.dtype)
+        return [
+            TransformState(**{name: value[i].copy() for name, value in kept.items()})
+            for i in range(len(self._sent))
+        ]
+
     def _forward(
         self, times: NDArray[np.float64], values: NDArray[np.float64], seen: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], RecurrentState | Batch]:
@@ -316,6 +355,7 @@ def _joined(past: Batch | None, row: Batch, window: int) -> Batch:
     return replace(row, **parts)
 
 
+_SENT = "transforms."
 _ROWS = ("times", "values", "mask", "known", "valid")
 
 

@@ -1,0 +1,58 @@
+"""Measures and demonstrations of the examples of policies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import offbeat as ob
+from examples.policies.measures import distances, swept_error_area
+from examples.policies.shapes import RETURNS_S, cloned, pushed
+
+TURN = np.linspace(0, 2 * np.pi, 2001)[:, None]
+CIRCLE = np.concatenate([np.cos(TURN), np.sin(TURN)], axis=1)
+
+
+def test_the_swept_area_is_that_between_two_lines_and_two_circles():
+    x = np.linspace(0, 10, 50)
+    line = np.stack([x, 3 + 0 * x], axis=1)
+    assert swept_error_area(line, line - [0, 2]) == pytest.approx(20)
+    assert swept_error_area(3 * CIRCLE, CIRCLE) == pytest.approx(np.pi * (9 - 1), rel=1e-5)
+    assert swept_error_area(CIRCLE, CIRCLE) == 0
+    with pytest.raises(ValueError, match="two paths of"):
+        swept_error_area(CIRCLE, CIRCLE[1:])
+
+
+def test_distances_of_concentric_circles_are_the_difference_of_their_radii():
+    pytest.importorskip("shapely")
+    pytest.importorskip("dtaidistance")
+    found = distances(3 * CIRCLE[::20], CIRCLE[::20])
+    assert found["frechet"] == pytest.approx(2)
+    assert found["dtw"] == pytest.approx(2)
+
+
+def test_a_pushed_demonstration_moves_as_its_velocities_say_but_for_the_push():
+    times = np.linspace(0, 2, 4001)
+    values = np.stack([np.sin(times), times**2, np.cos(times), 2 * times], axis=1)
+    demo = cloned(ob.Trajectory(times, values, names=("x", "y", "vx", "vy")), 1.0, _random())
+    other = pushed(demo, _random())
+    moved = np.diff(other.values[:, :2], axis=0) / np.diff(times)[:, None]
+    meant = (other.values[1:, 2:] + other.values[:-1, 2:]) / 2
+    wrong = np.flatnonzero(np.abs(moved - meant).max(axis=1) > 1e-2)
+    assert len(wrong) == 1  # the push itself
+    off = other.values[wrong[0] + 1 :, :2] - values[wrong[0] + 1 :, :2]
+    late = int(np.searchsorted(times, times[wrong[0]] + RETURNS_S)) - wrong[0]
+    assert np.allclose(off[late] / off[0], np.exp(-1), rtol=1e-2)
+
+
+def test_a_part_of_the_stamps_is_as_many_as_asked_with_both_ends():
+    times = np.linspace(0, 1, 200)
+    values = np.random.default_rng(0).normal(size=(200, 4))
+    some = cloned(ob.Trajectory(times, values, names=("x", "y", "vx", "vy")), 0.3, _random())
+    assert len(some.times) == 60
+    assert (some.times[0], some.times[-1]) == (0.0, 1.0)
+    assert some.roles == ("state", "state", "action", "action")
+
+
+def _random() -> np.random.Generator:
+    return np.random.default_rng(3)
