@@ -461,6 +461,37 @@ def test_a_million_million_episodes_are_those_on_disk(tmp_path):
         read(path)
 
 
+def test_a_last_number_that_may_be_cut_off_is_said_aloud(tmp_path):
+    (tmp_path / "log.csv").write_text(("time,x,y\n" + tables.BODY)[:-6])
+    assert "without a line end after" in notes(read(tmp_path / "log.csv"))
+
+
+@pytest.mark.parametrize(("name", "step"), [("s", 1), ("ms", 1000), ("us", 10**6), ("ns", 10**9)])
+@pytest.mark.parametrize("suffix", [".tum", ".txt"])
+def test_poses_have_the_unit_of_time_that_their_numbers_show(name, step, suffix, tmp_path):
+    stamps = [1_764_000_000 * step + i * step // 50 for i in range(20)]
+    if name == "s":
+        stamps = [f"1764000000.{i * 2:02d}0000007" for i in range(20)]
+    (tmp_path / f"log{suffix}").write_text("".join(f"{t} 1 2 3 0 0 0 1\n" for t in stamps))
+    dataset = read(tmp_path / f"log{suffix}")
+    assert dataset[0].times == pytest.approx(np.arange(20) / 50, abs=1e-9)
+    assert dataset.meta["time_unit"] == name
+    assert f"taken to be in {name}: numbers near" in notes(dataset)
+    slow = read(tmp_path / f"log{suffix}", time_unit="ms" if name == "s" else "s", max_gap_s=None,
+                clock_jumps="join")  # fmt: skip
+    assert slow[0].times[1] == pytest.approx(2e-5 if name == "s" else step / 50)
+
+
+def test_a_csv_of_euroc_counts_nanoseconds_since_1970(tmp_path):
+    for step, unit in ((10**9, "ns"), (10**6, "us"), (1000, "ms")):
+        stamps = [1_764_000_000 * step + i * step // 50 for i in range(20)]
+        (tmp_path / "log.csv").write_text("#timestamp,x\n" + "".join(f"{t},1\n" for t in stamps))
+        dataset = read(tmp_path / "log.csv")
+        assert dataset.meta["format"] == ("euroc" if unit == "ns" else "csv")
+        assert dataset.meta["time_unit"] == unit
+        assert dataset[0].times == pytest.approx(np.arange(20) / 50, abs=1e-9)
+
+
 IMU = "#stamp wx wy wz ax ay az host\n"
 POSE = "# timestamp tx ty tz qw qx qy qz\n"
 

@@ -143,6 +143,8 @@ class TestCsv:
         dataset = read(csv_file(f"x,{name}\n1,0\n2,500\n"), clock_jumps="join")
         per_unit = {"s": 500.0, "ms": 0.5, "us": 0.0005, "100ns": 5e-5, "ns": 5e-7}
         per_unit |= {"min": 30_000.0, "h": 1_800_000.0, "d": 43_200_000.0}
+        per_unit |= {"millis": 0.5, "micros": 0.0005, "milliseconds": 0.5, "microseconds": 0.0005}
+        per_unit |= {"nanoseconds": 5e-7}
         seconds = per_unit.get(name.lower().rpartition("_")[2], 500.0)
         assert dataset[0].times.tolist() == [0.0, seconds]
         assert dataset.names == ("x",)

@@ -196,6 +196,57 @@ KINDS: dict[str, Kind] = {
         {"stamp": [np.nan] * ROWS, **XY},
         formats=("csv", "parquet"),
     ),
+    "motors that take turns": Kind(
+        {"time": np.repeat(TIMES, 2), "motor_id": np.tile([3, 4], ROWS), **TWO},
+        {"GyrX[3]": X, "AccZ[3]": [-9.8] * ROWS, "GyrX[4]": Y, "AccZ[4]": [-10.8] * ROWS},
+        note="rows are of the sensor in column 'motor_id'",
+    ),
+    "boards that take turns": Kind(
+        {"time": np.repeat(TIMES, 2), "board": np.tile([0, 1], ROWS), "q": TWO["GyrX"]},
+        {"q[0]": X, "q[1]": Y},
+        note="rows are of the sensor in column 'board'",
+    ),
+    "numbers of channels": Kind(
+        {"time": np.repeat(TIMES, 2), "channel": np.tile([1, 2], ROWS), "value": TWO["GyrX"]},
+        {"1": X, "2": Y},
+    ),
+    "a long form of InfluxDB": Kind(
+        {"_time": np.repeat(TIMES, 2), "_field": ["a", "b"] * ROWS, "_value": TWO["GyrX"]},
+        {"a": X, "b": Y},
+    ),
+    "texts that take turns without a common stamp": Kind(
+        {"time": TIMES, "mac": ["a1", "b2"] * (ROWS // 2), **XY},
+        XY,
+        note="instance_column=mac gives every sensor its own channels",
+    ),
+    "a counter of microseconds after half an hour": Kind(
+        {"timestamp": 1_900_000_000 + STEP_NS // 1000 * np.arange(ROWS), **XY},
+        XY,
+        note="taken to be in us",
+    ),
+    "milliseconds with a fraction": Kind(
+        {"time": 8.125 * np.arange(ROWS), **XY},
+        XY,
+        times=8.125 * np.arange(ROWS),
+        note="names no unit; if they count ms (123.1 Hz)",
+    ),
+    "Julian days": Kind(
+        {"time": 2_461_004.5 + np.arange(ROWS) / 2**18, **XY},
+        XY,
+        times=np.arange(ROWS) * 86_400 / 2**18,
+        note="days since 4713 BC",
+    ),
+    "a header of milliseconds over seconds": Kind(
+        {"time_ms": TIMES / 2, **XY},
+        XY,
+        times=TIMES / 2000,
+        note="a row every 1e-05 s; if they are not",
+    ),
+    "millis of a board": Kind({"millis": 20 * np.arange(ROWS), **XY}, XY),
+    "milliseconds since 1970": Kind({"unix_ms": NS // 10**6, **XY}, XY),
+    "rows in descending time": Kind(
+        {"time": TIMES[::-1], "x": X[::-1]}, {"x": X}, note="39 of 40 rows are out of order"
+    ),
     "channels called signal and value": Kind(
         {"time": TIMES, "signal": X, "value": Y}, {"signal": X, "value": Y}
     ),
@@ -263,6 +314,27 @@ TEXTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     ),
     "an unnamed column of times": (",x,y\n" + BODY, {}, "is taken for the time"),
     "delimiters at the end of rows": ("time,x,y\n" + BODY.replace("\n", ",\n"), {}, ""),
+    "several forms of line ends": (
+        "time,x,y\n" + BODY.replace("\n", "\r\n", 9).replace("\n", "\n\r\n", 3)[:-1] + "\r", {}, "",
+    ),
+    "line ends of old and of new systems": (
+        "time,x,y\r" + BODY.replace("\n", "\r", 20), {}, "",
+    ),
+    "rows of empty fields": (
+        "time,x,y\n" + BODY.replace("\n", "\n,,\n", 5) + ",,\n  \n , ,\n", {}, "",
+    ),
+    "files with marks that are joined": (
+        ("time,x,y\n" + BODY[: len(BODY) // 2]).rpartition("\n")[0] + "\n\ufefftime,x,y\n"
+        + BODY[BODY.rindex("\n", 0, len(BODY) // 2) + 1 :], {}, "the header stands again",
+    ),
+    "bytes of 0 at the end": (("time,x,y\n" + BODY + "\0" * 999).encode(), {}, "bytes of 0 from"),
+    "Windows-1252 after the first block": (
+        ("# " + "-" * 70_000 + "\ntime,x,y\n" + BODY + "# 20 \xb0C\n").encode("cp1252"), {},
+        "read as Windows-1252",
+    ),
+    "a last number without a line end": (
+        "time,x,y\n" + BODY[:-2].rpartition("\n")[0] + f"\n0.78,{X[-1]},{Y[-1]}", {}, "",
+    ),
     "plus signs": ("time,x,y\n" + BODY.replace(",0.", ",+0."), {}, ""),
     "UTF-16": (("time,x,y\n" + BODY).encode("utf-16"), {}, ""),
     "Windows-1252": ("time,x,y,d\xe9j\xe0\n".encode("cp1252")
@@ -294,6 +366,26 @@ REFUSED: dict[str, tuple[Columns, dict[str, Any], str]] = {
     "several stamps": (
         {"imu/stamp/sec": SEC, "imu/stamp/nanosec": REST, "odom/stamp/sec": SEC,
          "odom/stamp/nanosec": REST, "x": X}, {}, "has several stamps, each in two columns",
+    ),
+    "hours, minutes and seconds": (
+        {"hours": [13] * ROWS, "minutes": [59] * ROWS, "seconds": TIMES, "x": X}, {},
+        "has the time in several columns",
+    ),
+    "digits of a date": (
+        {"time": 20251124131000 + np.arange(ROWS), "x": X}, {}, "whose digits are those of a date",
+    ),
+    "digits of hours, minutes and seconds": (
+        {"time": 131040.0 + np.arange(ROWS) + 40 * (np.arange(ROWS) >= 20), "x": X}, {},
+        "such as 131040 in 'time', whose digits",
+    ),
+    "rows counted in each second": (
+        {"time": np.arange(ROWS) // 10, "index": np.arange(ROWS) % 10, "x": X}, {},
+        "rows have the time stamp of",
+    ),
+    "an angle in counts": (
+        {"time": TIMES, "joint": 300 * np.arange(ROWS) % 4096},
+        {"angles": ["joint"], "units": {"joint": "count"}},
+        "is in 'count', expected rad or deg",
     ),
     "an angle of rad or deg": (
         {"time": TIMES, "yaw": np.linspace(0, 50, ROWS)}, {"angles": ["yaw"]},

@@ -42,6 +42,11 @@ _UNIT_OF = {spelling: unit for unit, names in _SPELLINGS.items() for spelling in
 _STEMS = ("time", "t", "timestamp", "stamp", "clock")
 _SHORT = ("s", "ms", "us", "100ns", "ns")
 _LONG = ("time", "timestamp", "elapsed")  # stems of minutes, hours, days: t_min is a minimum
+_SINCE = (  # stems of names that end in a unit
+    *("elapsed", "elapsed_time", "uptime", "epoch", "epoch_time", "unix", "unix_time", "utc"),
+    *("system_time", "boot_time", "gps_time", "log_time", "device_time", "sensor_time"),
+)
+_ALONE = ("millis", "micros", "milliseconds", "microseconds", "nanoseconds")
 TIME_NAMES = (
     *_STEMS,
     *(f"{stem}_{unit}" for stem in _STEMS for unit in _SHORT),
@@ -49,6 +54,7 @@ TIME_NAMES = (
     *("times", "timestamps", "time_stamp", "datetime", "date_time", "elapsed", "elapsed_time"),
     *("rosbag_timestamp", "ros_time", "header_stamp", "field_header_stamp", "log_time"),
     *("epoch", "unix_time", "unixtime", "utc", "utc_time", "sec", "secs", "seconds", "ts"),
+    *("gps_time", "uptime", "zeit", "zeitstempel", "uhrzeit", "x_value", *_ALONE),
 )
 """Names of time columns, in any case; the first one in a file is used. Names with a
 unit give the unit, as do units in brackets, as in `t [ns]` and `Time (ms)`. A point, a blank or a
@@ -114,7 +120,8 @@ def time_unit_in(name: str) -> str | None:
     stem, _, last = folded(name).rpartition("_")
     if stem and (last not in ("d", "h", "min") or stem in _LONG):
         return _UNIT_OF.get(last)
-    return "s" if last in ("sec", "secs", "seconds") else None
+    alone = last in ("sec", "secs", "seconds", *_ALONE)
+    return _UNIT_OF[last] if alone and not stem else None
 
 
 def time_column_of(names: Sequence[str]) -> str | None:
@@ -126,7 +133,9 @@ def time_column_of(names: Sequence[str]) -> str | None:
         if usual in stems:
             return stems[usual]
     for stem, name in stems.items():
-        if time_unit_in(name) and stem.split("_")[0] in _STEMS:
+        if time_unit_in(name) and (
+            stem.split("_")[0] in _STEMS or stem.rpartition("_")[0] in _SINCE
+        ):
             return name
     # Such as host_timestamp; many names end in `time` and are durations.
     return next((n for s, n in stems.items() if s.endswith(("_timestamp", "_stamp"))), None)
@@ -190,11 +199,12 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
 
     A clock that shows a date from 2000 to 2100 is in the only unit that fits its numbers:
     seconds, milliseconds, microseconds, nanoseconds or ticks of 100 ns since 1970, or ticks since
-    1601 (Windows) or the year 1 (.NET). A clock with another origin is in seconds, unless
-    its median step would then be longer than 10 s and three steps or more agree. Then it is in the
-    unit, of `ms`, `us` and `ns`, with the rate closest to 100 Hz. Days since 1900 (Excel) or since
-    the year 0 (MATLAB) from 2000 to 2100 are days, where seconds would be more than 50,000 rows a
-    second.
+    1601 (Windows) or the year 1 (.NET), unless its median step would then be longer than 1000 s: a
+    counter of microseconds passes such numbers after a quarter of an hour. A clock with another
+    origin is in seconds, unless its median step would then be longer than 10 s and three steps or
+    more agree. Then it is in the unit, of `ms`, `us` and `ns`, with the rate closest to 100 Hz.
+    Days since 1970, 1900 (Excel), the year 0 (MATLAB) or noon of 1 January 4713 BC (Julian) from
+    2000 to 2100 are days, where seconds would be more than 50,000 rows a second.
 
     Args:
         clock: (n,) numbers, in the order of the log.
@@ -208,15 +218,16 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
     if not numbers.size:
         return "s", ""
     middle = float(np.median(numbers))
-    for meaning, (unit, before) in _EPOCHS.items():
-        seconds = middle / (10**9 / NANOSECONDS_PER[unit]) - before
-        if _FIRST_YEAR <= seconds <= _LAST_YEAR:
-            return unit, f"numbers near {middle:.3g} are {meaning}"
     steps = np.diff(numbers)
     steps = steps[steps > 0]
-    if len(steps) < 3:
+    step = float(np.median(steps)) if len(steps) >= 3 else 0.0
+    for meaning, (unit, before) in _EPOCHS.items():
+        per_second = 10**9 / NANOSECONDS_PER[unit]
+        seconds = middle / per_second - before
+        if _FIRST_YEAR <= seconds <= _LAST_YEAR and step <= _SLOWEST_EPOCH_S * per_second:
+            return unit, f"numbers near {middle:.3g} are {meaning}"
+    if not step:
         return "s", ""
-    step = float(np.median(steps))
     if step < _FASTEST_S:
         for meaning, (first, last) in _DAYS.items():
             if first <= middle <= last:
@@ -231,10 +242,17 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
     )
 
 
-_DAYS = {"days since 1900": (36526.0, 73051.0), "days since the year 0": (730486.0, 767011.0)}
-"""Days of 2000 and 2100 as Excel and MATLAB count them."""
+_DAYS = {
+    "days since 1970": (10957.0, 36526.0),
+    "days since 1900": (36526.0, 73051.0),
+    "days since the year 0": (730486.0, 767011.0),
+    "days since 4713 BC": (2451544.0, 2488070.0),
+}
+"""Days of 2000 and 2100 as R, Excel, MATLAB and astronomers count them."""
 
 _FASTEST_S = 2e-5
+_SLOWEST_EPOCH_S = 1000.0
+_SLOW_S = 0.5  # a row per this time or longer is said aloud, where no unit is stated
 
 
 class TimeUnit(NamedTuple):
@@ -274,28 +292,93 @@ def state_time_unit(given: str | None, name: str, clock: ArrayLike, where: str) 
                 given, (f"times are read in {given}, as time_unit says, not as {name!r} does",)
             )
         return TimeUnit(given, ())
+    numbers = np.asarray(clock, dtype=np.float64)
+    numbers = numbers[np.isfinite(numbers)]
+    steps = np.diff(numbers)
+    steps = steps[steps > 0]
+    step = float(np.median(steps)) if len(steps) >= 3 else 0.0
     if named is not None:
-        return TimeUnit(named, ())
+        seconds = step * NANOSECONDS_PER[named] / 1e9
+        if not seconds or _FASTEST_S <= seconds * 1.001 <= _SLOWEST_EPOCH_S:
+            return TimeUnit(named, ())
+        return TimeUnit(
+            named,
+            (
+                f"times are read in {named}, as {name!r} says: a row every {seconds:.3g} s; if "
+                "they are not, state their unit with time_unit",
+            ),
+        )
+    if packed := _packed(numbers, folded(name)):
+        raise FileFormatError(
+            f"{where} has times such as {packed} in {name!r}, whose digits are {_PACKED}; write "
+            "them as 2026-11-24T21:00:00 or 21:00:00, or give time_unit= if they are plain numbers"
+        )
     unit, why = find_time_unit(clock)
     if why:
         return TimeUnit(
             unit, (f"time is taken to be in {unit}: {why}; state it with time_unit",), True
         )
-    numbers = np.asarray(clock, dtype=np.float64)
-    steps = np.diff(numbers[np.isfinite(numbers)])
-    steps = steps[steps > 0]
-    if len(steps) >= 3 and (steps == np.floor(steps)).all():
-        step = float(np.median(steps))
+    whole = step > 0 and bool((steps == np.floor(steps)).all())
+    if whole or step >= _SLOW_S:
         return TimeUnit(
             unit,
             (
-                f"time is taken to be in s, a row every {step:g} s: {name!r} holds whole numbers "
-                f"and names no unit; if they count ms ({1000 / step:.4g} Hz), or anything else, "
-                "state it with time_unit",
+                f"time is taken to be in s, a row every {step:g} s: {name!r} "
+                f"{'holds whole numbers and ' * whole}names no unit; if they count ms "
+                f"({1000 / step:.4g} Hz), or anything else, state it with time_unit",
+            ),
+            True,
+        )
+    if 0 < step < _FASTEST_S:
+        return TimeUnit(
+            unit,
+            (
+                f"time is taken to be in s, a row every {step:.3g} s: {name!r} names no unit; if "
+                "they count days, or anything else, state it with time_unit",
             ),
             True,
         )
     return TimeUnit(unit, (), True)
+
+
+_PACKED = "those of a date or of hours, minutes and seconds"
+_DIGITS = ((100, 60), (100, 60), (100, 24), (100, 32), (100, 13), (10_000, 2101))
+
+
+def _packed(numbers: NDArray[np.float64], name: str) -> str:
+    """The first of numbers whose digits are a time, such as 20261124210000 and 210000; or empty.
+
+    Those of hours, minutes and seconds alone are plain numbers, too, unless they pass from 59 to
+    100 seconds or minutes, or are named `utc`.
+    """
+    if len(numbers) < 3 or (numbers < 0).any():
+        return ""
+    first = f"{numbers[0]:.15g}"
+    high = float(numbers.max())
+    if 1.9e13 < high < 2.11e13:
+        return first if _are_digits(numbers, 6) and (numbers // 1e8 % 100 > 0).all() else ""
+    if 1.9e16 < high < 2.11e16:
+        return first if _are_digits(numbers // 1000, 6) else ""
+    if not 100 < high < 240_000 or not _are_digits(numbers, 3):
+        return ""
+    seconds = numbers // 10_000 * 3600 + numbers // 100 % 100 * 60 + numbers % 100
+    steps, decoded = np.diff(numbers), np.diff(seconds)
+    if (decoded < 0).any() or (decoded == 0).all():
+        return ""
+    usual = float(np.median(decoded))
+    passes = (steps - decoded >= 40) & (decoded <= 3 * usual) & (usual < 20)
+    named = name.startswith(("utc", "gmt", "hhmmss")) and bool((numbers >= 100).all())
+    return first if passes.any() or named else ""
+
+
+def _are_digits(numbers: NDArray[np.float64], parts: int) -> bool:
+    """Whether the digits of numbers are seconds, minutes, hours, days, months and years."""
+    rest = numbers
+    for base, end in _DIGITS[:parts]:
+        if not (rest % base < end).all():
+            return False
+        rest = rest // base
+    return True
 
 
 def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], int]:

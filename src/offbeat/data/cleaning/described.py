@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -11,8 +12,10 @@ import numpy as np
 from offbeat.data.cleaning.channels import find_quaternions
 from offbeat.data.cleaning.options import ReaderOptions
 from offbeat.data.signals import MOST_CHANNELS, Recording, Signal
-from offbeat.data.transforms import full_turn
+from offbeat.data.transforms import full_turn, is_angle_unit
 from offbeat.errors import FileFormatError, InputError, listed, one_of
+
+_ANGLE_UNIT = re.compile(r"(?:^|[_.\s\-/])(deg|degrees?|rad|radians?)$")
 
 
 @dataclass(frozen=True)
@@ -90,9 +93,17 @@ class Channels:
         for name in options.angles:
             at = known("channel in angles", name)
             kinds[at] = "angle"
-            if not units[at]:
+            named = _ANGLE_UNIT.search(name.casefold())
+            if not units[at] and named:
+                units[at] = named[1][:3]
+            elif not units[at]:
                 degrees[name] = _is_in_degrees(name, columns, at, recordings)
                 units[at] = "deg" if degrees[name] else ""
+            elif not is_angle_unit(units[at]):
+                raise InputError(
+                    f"the angle {name!r} is in {units[at]!r}, expected rad or deg, so that its "
+                    "jumps by a turn are known; convert it, or take it out of angles"
+                )
         gone = {name for recording in recordings for name in recording.left_out}
         left_out: set[str] = set()
         for name in options.without:

@@ -210,6 +210,11 @@ def _ordered(
     name = signal.name or (signal.channels[0] if len(signal.channels) == 1 else "rows")
     if len(found.late):
         log.late[name] += len(found.late)
+        if len(found.late) > max(_FEW, len(signal.stamps) // _ONE_IN):
+            log.notes[
+                f"{len(found.late)} of {len(signal.stamps)} rows are out of order, and are put in "
+                "the order of their times; if they are of several logs or sensors, read those apart"
+            ] = None
     stamps, values = anomalies.in_order(signal.stamps, signal.values, options.order)
     before = len(stamps)
     if options.duplicates == "auto" and len(found.duplicates) > max(_FEW, before // _ONE_IN):
@@ -217,8 +222,9 @@ def _ordered(
         if lost > max(_FEW, before // _ONE_IN):
             raise FileFormatError(
                 f"{_where(signal, recording)}{lost} of {before} rows have the time stamp of "
-                "another row and other values. Name the column of the time, or of the instance or "
-                "trajectory of each row; duplicates=last (or first, mean) merges such rows"
+                "another row and other values. Name the column of the time (time_column=), of the "
+                "sensor of each row (instance_column=) or of its trajectory (trajectory_column=); "
+                "duplicates=last (or first, mean) merges such rows"
             )
     stamps, values = anomalies.one_row_per_stamp(stamps, values, options.duplicates)
     if before > len(stamps):

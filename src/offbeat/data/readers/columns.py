@@ -31,12 +31,15 @@ from offbeat.errors import FileFormatError, InputError, listed, one_of
 LABEL_NAMES = ("trajectory", "episode", "episode_index", "demo")
 """Names of trajectory columns, in any case."""
 
-KEY_NAMES = ("channel", "variable", "signal", "sensor", "name", "key", "topic", "field")
+KEY_NAMES = (
+    *("channel", "variable", "signal", "sensor", "name", "key", "topic", "field", "device"),
+    *("joint", "joint_name", "sensor_name", "motor", "link", "marker", "tag", "node", "metric"),
+)
 VALUE_NAMES = ("value", "val", "data", "reading")
 """Names of the two columns of long tables besides the time, in any case."""
 
 
-INSTANCE_NAMES = ("i", "instance", "multi_id", "sensor_id", "imu_id", "imu", "id", "index")
+INSTANCE_NAMES = ("i", "instance", "multi_id", "imu", "id", "index", "motor", "joint", "sensor")
 """Names of columns with the number of the sensor of a row, in any case."""
 
 _MOST_INSTANCES = 64
@@ -236,6 +239,13 @@ class Columns:
                     *notes,
                     f"columns of text are left out: {listed(texts, 6, quoted=True)}",
                 )
+                turns = turns_of(self, texts, sample) if self.key is None else None
+                if turns is not None:
+                    notes = (
+                        *notes,
+                        f"rows take turns in column {turns!r}; if it names the sensor of each row, "
+                        f"instance_column={turns} gives every sensor its own channels",
+                    )
             if not kept:
                 raise FileFormatError(
                     f"{path} has no column of numbers besides the time, expected one per channel; "
@@ -328,6 +338,11 @@ def stamp_columns(
         _refuse_dates(path, names, time, options, sample)
         if dates and sample.is_text(time) and not _is_date(sample, time):
             return joined(dates[0], time, "date")
+        if folded(time) in _SECONDS and (minutes := [n for n in names if folded(n) in _MINUTES]):
+            raise FileFormatError(
+                f"{path} has the time in several columns, such as {minutes[0]!r} and {time!r}; add "
+                f"them up in one column of seconds, or take {time!r} alone with time_column="
+            )
         return made(time)
     if len(pairs) == 1:
         return joined(*pairs[0])
@@ -343,7 +358,9 @@ def stamp_columns(
     )
 
 
-_DATES = ("date", "day", "date_utc", "utc_date", "local_date")
+_DATES = ("date", "day", "date_utc", "utc_date", "local_date", "datum")
+_SECONDS = ("s", "sec", "secs", "second", "seconds")
+_MINUTES = ("min", "mins", "minute", "minutes", "hour", "hours")
 
 
 def _refuse_dates(
@@ -407,7 +424,7 @@ def _long_form(
 ) -> tuple[str | None, str | None]:
     first_of: dict[str, str] = {}
     for name in rest:
-        first_of.setdefault(name.casefold(), name)
+        first_of.setdefault(folded(name), name)
     keys = [first_of[name] for name in KEY_NAMES if name in first_of]
     values = [first_of[name] for name in VALUE_NAMES if name in first_of]
     channel_column, value_column = options.channel_column, options.value_column
@@ -456,23 +473,46 @@ def _instance_column(
         return _named(options.instance_column, rest, "instance")
     if len(rest) < 2 or options.channels is not None:
         return None
+    stamps = sample.texts(stamp.time) if stamp.time else []
+    if stamp.rest is not None:
+        stamps = list(map(str, zip(stamps, sample.texts(stamp.rest), strict=False)))
+    times = sample.numbers(stamp.time) if stamp.time else np.zeros(0)
+    # Of stamps in whole seconds, a column may count the rows of each second.
+    coarse = stamp.rest is None and times.size and bool((np.diff(times) % 1 == 0).all())
+    shared = 5 * (len(stamps) - len(set(stamps))) >= len(stamps)  # not by chance
     for name in rest:
-        usual = name.casefold()
-        if usual in KEY_NAMES and sample.is_text(name):
-            texts = sample.texts(name)
-            different = set(texts)
-            few = 1 < len(different) <= min(_MOST_INSTANCES, len(texts) // 2)
-            if few and "" not in different and _take_turns(stamp, texts, sample):
+        usual = folded(name)
+        texts = sample.texts(name)
+        different = set(texts)
+        few = 1 < len(different) <= min(_MOST_INSTANCES, len(texts) // 2) and "" not in different
+        if not few:
+            continue
+        if sample.is_text(name):
+            if usual in KEY_NAMES and _take_turns(stamp, texts, sample):
                 return name
-        elif usual in INSTANCE_NAMES and not sample.is_text(name):
+        else:
             numbers = sample.numbers(name)
-            stamps = sample.texts(stamp.time) if stamp.time else []
-            if stamp.rest is not None:
-                stamps = list(map(str, zip(stamps, sample.texts(stamp.rest), strict=False)))
-            pairs = set(zip(stamps, numbers.tolist(), strict=False))
-            count = len(set(numbers.tolist()))
-            few = count <= min(_MOST_INSTANCES, len(numbers) // 2)
-            shared = 5 * (len(stamps) - len(set(stamps))) >= len(stamps)  # not by chance
-            if few and shared and len(stamps) == len(pairs) == len(numbers):
-                return name
+            if not len(numbers) or (numbers != np.floor(numbers)).any():
+                continue
+            if coarse and (usual == "index" or usual not in INSTANCE_NAMES):
+                continue
+        apart = len(set(zip(stamps, texts, strict=False))) == len(stamps) == len(texts)
+        named = not sample.is_text(name) and usual in INSTANCE_NAMES
+        turns = 4 * sum(a != b for a, b in itertools.pairwise(texts)) >= len(texts)
+        likely = turns and (usual.endswith("_id") or len(different) <= _MOST_UNNAMED)
+        if shared and apart and (named or likely):
+            return name
+    return None
+
+
+_MOST_UNNAMED = 16  # sensors in a column of any name
+
+
+def turns_of(stamp: Columns, names: list[str], sample: Sample) -> str | None:
+    """A column of texts whose rows take turns, as those of several sensors may; or None."""
+    for name in names:
+        texts = sample.texts(name)
+        few = 1 < len(set(texts)) <= min(_MOST_INSTANCES, len(texts) // 4) and "" not in texts
+        if few and form_of(texts[0]) is None and _take_turns(stamp, texts, sample):
+            return name
     return None

@@ -20,7 +20,7 @@ from offbeat.data.readers.batches import NullValueError, gather, line_error, wit
 from offbeat.data.readers.columns import Columns
 from offbeat.data.readers.csv_fields import BOOLEANS, GROUPED_BY_POINTS, Converter, number_in
 from offbeat.data.readers.csv_layout import CsvLayout, is_comment
-from offbeat.data.readers.csv_streams import Spaced, Without, with_count, with_dates
+from offbeat.data.readers.csv_streams import Spaced, Without, with_count, with_dates, without_empty
 from offbeat.data.readers.gathered import Coded, Gathered
 from offbeat.data.readers.stamps import expected_after, form_of, over_midnight, with_stamps
 from offbeat.data.readers.text import DAMAGE, TextFile, no_text
@@ -30,6 +30,7 @@ _COMMA = re.compile(r"[+-]?\d+,\d+")
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 _SAMPLE = 1000  # lines from which the meaning of a column is derived
 _BLOCK = 1 << 20  # bytes of text in memory at a time
+_TAIL = 1 << 12  # last bytes, from which a cut is found
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,8 @@ class CsvFile:
         missing: fields whose value is not known.
         notes: on what was found while it was read.
         odd: rows with another number of fields.
-        repeated: a header that stands in the middle, too.
+        tail: the last bytes.
+        repeated: lines of a header, and of units below it, that stand in the middle, too.
     """
 
     text: TextFile
@@ -86,7 +88,8 @@ class CsvFile:
     missing: tuple[str, ...]
     notes: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
-    repeated: str = ""
+    tail: list[bytes] = field(default_factory=lambda: [b""])
+    repeated: tuple[str, ...] = ()
 
     @property
     def path(self) -> Path:
@@ -228,6 +231,7 @@ class CsvFile:
             except NullValueError as error:
                 raise self._empty(error, columns) from None
             self._check_odd(header, columns)
+            self._note_short_end(header, sample)
             if not len(table.clock):
                 raise FileFormatError(
                     f"{self.path} has a header and no rows, expected one per time"
@@ -305,25 +309,26 @@ class CsvFile:
                 ),
             ) as reader,
         ):
-            yield from reader
+            for batch in reader:
+                yield without_empty(batch)
 
     def _stream(self) -> Any:
         file = self.text.bytes_from(self.layout.first)
         if self.repeated:
-            return Without(file, self.repeated.encode())
+            return Without(file, [line.encode() for line in self.repeated])
         return file if self.layout.delimiter != " " else Spaced(file)
 
-    def _header_again(self) -> str:
-        """The line of the header, if there is another such line; else an empty text."""
+    def _header_again(self) -> tuple[str, ...]:
+        """The lines of the header, if they stand in the file again; else none."""
         if not self.layout.line or self.layout.delimiter == " ":
-            return ""
-        lines = (line.strip() for line in self.text.lines())
-        header = next(itertools.islice(lines, self.layout.line - 1, None), "")
-        return header if header in lines else ""
+            return ()
+        lines = (line.strip().removeprefix("\ufeff") for line in self.text.lines())
+        head = tuple(itertools.islice(lines, self.layout.line - 1, self.layout.first - 1))
+        return tuple(line for line in head if line) if head and head[0] in lines else ()
 
     def _on_odd_row(self, row: Any) -> str:
         """Skips comments and, provisionally, one row with another number of fields."""
-        if is_comment(row.text):
+        if is_comment(row.text) or not row.text.strip():
             return "skip"
         self.odd.append(row.text)
         return "skip" if len(self.odd) == 1 else "error"
@@ -369,6 +374,7 @@ class CsvFile:
         texts = converter.texts()
         if len(texts) == len(columns.channels) and texts:
             self._explain(header, columns, sample)
+            raise self._bad_field(header, columns, converter.bad[texts[0]].row, texts[0], sample)
         for c, bad in converter.bad.items():
             if c in texts:
                 continue
@@ -411,22 +417,39 @@ class CsvFile:
         )
 
     @property
-    def _fields_of_header(self) -> list[str]:
-        return [field.strip() for field in self.repeated.split(self.layout.delimiter)]
+    def _fields_of_header(self) -> list[list[str]]:
+        return [[f.strip() for f in line.split(self.layout.delimiter)] for line in self.repeated]
 
     def _count_lines(self) -> int:
         """Number of lines from the first row on, an upper bound of the number of rows."""
         ends = returns = 0
-        last = b""
+        tail = b""
         try:
             with self.text.bytes_from(self.layout.first) as file:
                 while block := file.read(_BLOCK):
                     ends += block.count(b"\n")
-                    returns += block.count(b"\r") if not ends else 0
-                    last = block[-1:]
+                    returns += block.count(b"\r") - block.count(b"\r\n")
+                    tail = (tail + block)[-_TAIL:]
         except DAMAGE as error:
             raise no_text(self.path, error) from None
-        return max(ends, returns) + (last not in b"\r\n")
+        self.tail[:] = [tail]
+        return ends + returns + (tail[-1:] not in b"\r\n")
+
+    def _note_short_end(self, header: list[str], sample: CsvSample) -> None:
+        """Notes a last number that may be cut off: without a line end, and shorter than others."""
+        line = self.tail[0].decode("utf-8", "replace").splitlines()[-1:]
+        if not line or self.tail[0].endswith((b"\n", b"\r")):
+            return
+        fields = line[0].split() if self.layout.delimiter == " " else (
+            line[0].split(self.layout.delimiter)
+        )  # fmt: skip
+        others = sorted(len(f) for f in sample.fields[header[-1]][:-1])
+        short = len(fields) == len(header) and others
+        if short and len(fields[-1].strip()) < others[len(others) // 10]:
+            self.notes.append(
+                f"the file ends without a line end after {fields[-1].strip()[:40]!r}, which may be "
+                "cut off"
+            )
 
     def _row(self, row: int) -> tuple[int, list[str]]:
         """The line in which a row of data ends, and its fields."""
@@ -484,9 +507,11 @@ class CsvFile:
         """Line numbers and fields of the rows, without comments."""
         for line, fields in self.text.rows(self.layout.delimiter):
             odd = len(fields) != len(self.layout.names)
-            if self.repeated and [f.strip() for f in fields] == self._fields_of_header:
+            if self.repeated and [f.strip("\ufeff ") for f in fields] in self._fields_of_header:
                 continue
-            if line >= self.layout.first and not (odd and is_comment(fields[0])):
+            if line < self.layout.first or (odd and is_comment(fields[0])):
+                continue
+            if any(map(str.strip, fields)):
                 yield line, fields
 
 

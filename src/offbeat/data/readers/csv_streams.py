@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,19 +10,22 @@ import numpy as np
 from offbeat.data.readers.columns import Columns
 from offbeat.data.readers.stamps import date_and_time
 
+_AROUND = b" \t\r\n\xef\xbb\xbf"  # blanks, and a byte order mark where files are joined
+
 
 class Without:
-    """A stream of text without some line."""
+    """A stream of text without some lines."""
 
     closed = False
 
-    def __init__(self, file: Any, line: bytes) -> None:
-        self.file, self.line = file, line
+    def __init__(self, file: Any, lines: Sequence[bytes]) -> None:
+        self.file, self.lines = file, frozenset(lines)
 
     def read(self, size: int = -1) -> bytes:
         """The next lines, about `size` bytes of them."""
         while lines := self.file.readlines(size if size > 0 else -1):
-            if text := b"".join(line for line in lines if line.strip() != self.line):
+            kept = (line for line in lines if line.strip(_AROUND) not in self.lines)
+            if text := b"".join(kept):
                 return text
         return b""
 
@@ -73,3 +76,23 @@ def with_count(batches: Iterator[Any], rate_hz: float) -> Iterator[Any]:
         start += batch.num_rows
         stamps = np.rint(rows * (1e9 / rate_hz)).astype(np.int64)
         yield batch.append_column("", pa.array(stamps))
+
+
+def without_empty(batch: Any) -> Any:
+    """A batch without the rows in which all columns are empty, as spreadsheets write them."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    empty = None
+    for column in batch.columns:
+        if pa.types.is_string(column.type):
+            missing = pc.equal(pc.binary_length(pc.utf8_trim_whitespace(column)), 0)
+        elif column.null_count:
+            missing = pc.is_null(column)
+        else:
+            return batch
+        missing = pc.fill_null(missing, True)
+        empty = missing if empty is None else pc.and_(empty, missing)
+        if not pc.any(empty).as_py():
+            return batch
+    return batch if empty is None else batch.filter(pc.invert(empty))

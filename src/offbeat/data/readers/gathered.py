@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import to_nanoseconds
-from offbeat.data.readers.columns import Columns
+from offbeat.data.readers.columns import VALUE_NAMES, Columns
 from offbeat.data.recording import Recording, Signal
 from offbeat.data.signals import MOST_CHANNELS
 from offbeat.errors import FileFormatError, one_of
@@ -143,8 +143,9 @@ def _by_key(
             f"{path} has {len(keys.texts)} different values in column {columns.key!r}, more than "
             f"{MOST_CHANNELS} channels; choose another column with channel_column="
         )
-    if columns.chosen is None and len(columns.channels) > 1:
-        numbered = all(text.lstrip("-").isdecimal() for text in keys.texts)
+    numbered = all(text.lstrip("-").isdecimal() for text in keys.texts)
+    of_sensors = numbered and columns.names[0].casefold() not in VALUE_NAMES
+    if columns.chosen is None and (len(columns.channels) > 1 or of_sensors):
         called = {
             text: tuple(f"{n}[{text}]" if numbered else f"{text}.{n}" for n in columns.names)
             for text in keys.texts

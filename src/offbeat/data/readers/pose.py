@@ -9,7 +9,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from offbeat.data.cleaning.clocks import split_unit, time_unit_in
+import numpy as np
+
+from offbeat.data.cleaning.clocks import (
+    NANOSECONDS_PER,
+    split_unit,
+    state_time_unit,
+    time_column_of,
+    time_unit_in,
+)
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.batches import NullValueError, gather
 from offbeat.data.readers.columns import Columns
@@ -39,6 +47,9 @@ _POSE = {
 }
 """Words by which headers name the columns of a pose."""
 
+_QUATERNION = {word for word, name in _POSE.items() if name.startswith("q")}
+
+_FIRST_NS, _LAST_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # 2000 and 2100
 _LINES = 200  # lines from which the meaning of the numbers is derived
 _OFF_1 = 0.05  # from the length of a quaternion
 _COPIES = 3  # copies of a text in memory while it is read
@@ -46,21 +57,25 @@ _COPIES = 3  # copies of a text in memory while it is read
 _TUM = Columns("timestamp", None, TUM_COLUMNS[1:], TUM_COLUMNS[1:], ("m",) * 3 + ("",) * 4)
 
 
-def read_tum(path: str | Path) -> list[Recording]:
+def read_tum(path: str | Path, *, time_unit: str | None = None) -> list[Recording]:
     """Reads a trajectory of poses in the format of the TUM RGB-D benchmark.
 
     Text without a header: per line `timestamp tx ty tz qx qy qz qw`, in seconds and metres, with
-    spaces between; lines that begin with # are comments. A comment that names eight columns in
-    another order, such as `qw` before `qx`, decides about the order. Stamps keep every digit to the
-    nanosecond. A last line that is cut off is left out, which is noted.
+    spaces between; times that count milliseconds or nanoseconds since 1970, as some programs write
+    them, are found by their numbers, which is noted. Lines that begin with # are comments. A
+    comment that names eight columns in another order, such as `qw` before `qx`, decides about the
+    order. Stamps keep every digit to the nanosecond. A last line that is cut off is left out, which
+    is noted.
 
     Source: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 
     Args:
         path: the file, in UTF-8.
+        time_unit: of the stamps; by default found by their numbers, else seconds.
 
     Raises:
         FileFormatError: the file is missing or empty, or a line does not have eight numbers.
+        InputError: the unit is unknown.
     """
     import io
 
@@ -84,7 +99,8 @@ def read_tum(path: str | Path) -> list[Recording]:
         notes = ("the file ends in the middle of a line; it is read up to there",)
     if columns != TUM_COLUMNS:
         notes = (*notes, f"the header names the columns {' '.join(columns)}")
-    for clock in (pa.decimal128(38, 9), pa.float64()):
+    integers = all(line.split(b" ", 1)[0].isdigit() for line in text[:10_000].splitlines())
+    for clock in (*([pa.int64()] if integers else []), pa.decimal128(38, 9), pa.float64()):
         try:
             batches = pv.read_csv(
                 io.BytesIO(text),
@@ -101,8 +117,23 @@ def read_tum(path: str | Path) -> list[Recording]:
             _explain(path)
     else:
         raise FileFormatError(f"{path} can't be read as TUM text; expected {' '.join(TUM_COLUMNS)}")
-    unit = "ns" if clock != pa.float64() else "s"
-    made = recordings(path, _TUM, unit, notes, table, shown="s")
+    counted = table.clock
+    as_number = counted / 1e9 if pa.types.is_decimal(clock) else counted
+    stated = state_time_unit(time_unit, "timestamp", as_number[:1000], str(path))
+    unit = stated.unit
+    if pa.types.is_decimal(clock):  # it counts 1e-9 of the unit
+        ticks = NANOSECONDS_PER[unit]
+        counted = counted if unit == "s" else np.rint(counted * (ticks / 1e9)).astype(np.int64)
+        unit = "ns"
+    made = recordings(
+        path,
+        _TUM,
+        unit,
+        (*notes, *stated.notes),
+        replace(table, clock=counted),
+        shown=stated.unit,
+        found=stated.found and bool(stated.notes),
+    )
     kinds = ("",) * 3 + ("quaternion",) * 4
     return [replace(one, signals=(replace(one.signals[0], kinds=kinds),)) for one in made]
 
@@ -153,6 +184,11 @@ def _order_in(lines: list[str]) -> tuple[str, ...] | None:
         words = [split_unit(word)[0].casefold() for word in words if word]
         words = [word for word in words if not word.startswith(("[", "("))]
         if len(words) != len(TUM_COLUMNS):
+            named = (
+                len(words) > 4 and time_column_of(words[:1]) and not set(words[1:]) & _QUATERNION
+            )
+            if named:
+                return ()
             continue
         order = tuple(_POSE.get(word, "") for word in words)
         known = sum(bool(name) for name in order)
@@ -240,7 +276,8 @@ def is_euroc(path: Path) -> bool:
     if time_unit_in(first.partition(",")[0]) is not None:
         return time_unit_in(first.partition(",")[0]) == "ns"
     rows = [line.partition(",")[0].strip() for line in _first_lines(path)[1:] if line.strip()]
-    return all(row.isdecimal() for row in rows if not row.startswith("#"))
+    numbers = [row for row in rows if not row.startswith("#")]
+    return all(row.isdecimal() and _FIRST_NS <= int(row[:25]) <= _LAST_NS for row in numbers)
 
 
 def _data_files(folder: Path) -> list[Path]:

@@ -43,12 +43,14 @@ class TextFile:
         path: of the file.
         encoding: of its text.
         notes: on an encoding that was assumed.
+        end: where bytes of 0 begin, or None; nothing is read from there on.
         cuts: why compressed data ended early, added as it is read.
     """
 
     path: Path
     encoding: str = "utf-8-sig"
     notes: tuple[str, ...] = ()
+    end: int | None = None
     cuts: list[str] = field(default_factory=list)
 
     @classmethod
@@ -69,22 +71,30 @@ class TextFile:
                 if "\0" in text or "\ufeff" in text[1:] or "\ufffd" in text[:-1]:
                     raise no_text(path, f"it is no {encoding}")
                 return cls(path, encoding)
-        if b"\0" in start:
+        at = start.find(b"\0")
+        if at >= 0 and (start.count(b"\n", 0, at) < 2 or start[at : at + 8].strip(b"\0")):
             raise no_text(path, "it holds bytes of 0")
         try:
-            codecs.getincrementaldecoder("utf-8")().decode(start)
-        except UnicodeDecodeError as error:
-            note = (
-                f"the text is not UTF-8 (byte 0x{start[error.start]:02x} at {error.start}); it is "
-                "read as Windows-1252"
+            bad, zero = _first_bad_byte(path)
+        except DAMAGE as error:
+            raise no_text(path, error) from None
+        notes: list[str] = []
+        if zero is not None:
+            notes.append(
+                f"there are bytes of 0 from byte {zero} on, as after a loss of power; the text is "
+                "read up to there"
             )
-            return cls(path, "cp1252", (note,))
-        return cls(path)
+        if bad is not None:
+            notes.append(
+                f"the text is not UTF-8 (byte 0x{bad[1]:02x} at {bad[0]}); it is read as "
+                "Windows-1252"
+            )
+        return cls(path, "utf-8-sig" if bad is None else "cp1252", tuple(notes), end=zero)
 
     def bytes_from(self, line: int) -> IO[bytes]:
         """A stream of the text in UTF-8, from a line on; the first one is line 1."""
         before = sum(len(text.encode()) for text in itertools.islice(self.lines(), line - 1))
-        file = _opened(self.path, self.cuts)
+        file = self._file()
         if self.encoding != "utf-8-sig":
             file = io.BufferedReader(_Recoded(file, self.encoding), _BLOCK)
         elif file.peek(3)[:3] == codecs.BOM_UTF8:
@@ -100,7 +110,7 @@ class TextFile:
             FileFormatError: a line is too long, or the text can't be decoded.
         """
         try:
-            binary = _opened(self.path, self.cuts)
+            binary = self._file()
             with io.TextIOWrapper(
                 binary, encoding=self.encoding, errors=self._errors, newline=""
             ) as file:
@@ -113,6 +123,10 @@ class TextFile:
                     yield line
         except DAMAGE as error:
             raise no_text(self.path, error) from None
+
+    def _file(self) -> io.BufferedReader:
+        file = _opened(self.path, self.cuts)
+        return file if self.end is None else io.BufferedReader(_UpTo(file, self.end), _BLOCK)
 
     @property
     def _errors(self) -> str:
@@ -162,6 +176,47 @@ def _opened(path: Path, cuts: list[str]) -> io.BufferedReader:
     if opener is open:
         return path.open("rb")
     return io.BufferedReader(_UpToTheCut(opener(path, "rb"), cuts), _BLOCK)
+
+
+def _first_bad_byte(path: Path) -> tuple[tuple[int, int] | None, int | None]:
+    """Place and value of the first byte that is not UTF-8, and the place of the first one of 0."""
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    bad: tuple[int, int] | None = None
+    place = 0
+    with _opened(path, []) as file:
+        while block := file.read(_BLOCK):
+            zero = block.find(b"\0")
+            block = block if zero < 0 else block[:zero]
+            waiting = len(decoder.getstate()[0])
+            if bad is None and (waiting or not block.isascii()):
+                try:
+                    decoder.decode(block)
+                except UnicodeDecodeError as error:
+                    bad = (place - waiting + error.start, error.object[error.start])
+            if zero >= 0:
+                return bad, place + zero
+            place += len(block)
+    return bad, None
+
+
+class _UpTo(io.RawIOBase):
+    """The first bytes of a file."""
+
+    def __init__(self, file: IO[bytes], end: int) -> None:
+        self.file, self.left = file, end
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        part = self.file.read(min(len(buffer), self.left))
+        self.left -= len(part)
+        buffer[: len(part)] = part
+        return len(part)
+
+    def close(self) -> None:
+        self.file.close()
+        super().close()
 
 
 class _UpToTheCut(io.RawIOBase):
