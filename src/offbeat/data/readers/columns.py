@@ -239,7 +239,7 @@ class Columns:
                     *notes,
                     f"columns of text are left out: {listed(texts, 6, quoted=True)}",
                 )
-                turns = turns_of(self, texts, sample) if self.key is None else None
+                turns = turns_of(texts, sample) if self.key is None else None
                 if turns is not None:
                     notes = (
                         *notes,
@@ -508,11 +508,12 @@ def _instance_column(
 _MOST_UNNAMED = 16  # sensors in a column of any name
 
 
-def turns_of(stamp: Columns, names: list[str], sample: Sample) -> str | None:
+def turns_of(names: list[str], sample: Sample) -> str | None:
     """A column of texts whose rows take turns, as those of several sensors may; or None."""
     for name in names:
         texts = sample.texts(name)
         few = 1 < len(set(texts)) <= min(_MOST_INSTANCES, len(texts) // 4) and "" not in texts
-        if few and form_of(texts[0]) is None and _take_turns(stamp, texts, sample):
+        turns = 4 * sum(a != b for a, b in itertools.pairwise(texts)) >= len(texts)
+        if few and turns and form_of(texts[0]) is None:
             return name
     return None
