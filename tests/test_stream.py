@@ -193,7 +193,8 @@ def test_a_state_that_left_the_finite_numbers_is_reset_and_counted(
 
 def test_a_row_at_which_an_adaptive_solver_gives_up_is_the_first_of_a_reset_state() -> None:
     model = small_model("ode_rnn", dtype=FLOAT32)
-    stream, new = Stream(model), Stream(model)
+    with kernels.use("reference"):
+        stream, new = Stream(model), Stream(model)
     observe, times = stream._engine.observe, []
 
     def gives_up(time: float, *row: Any) -> None:

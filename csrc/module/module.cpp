@@ -13,6 +13,7 @@
 #include <atomic>
 #include <cmath>
 #include <cstdio>
+#include <cstring>
 #include <exception>
 #include <memory>
 #include <mutex>
@@ -20,6 +21,7 @@
 #include <numeric>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -46,6 +48,7 @@ namespace {
 #include "perceptron.hpp"
 #include "gains.hpp"
 #include "stream.hpp"
+#include "in_order.hpp"
 
 template <class T>
 void bind(nb::module_& m, const char* suffix) {
@@ -170,6 +173,7 @@ void bind(nb::module_& m, const char* suffix) {
       nb::arg("started").noconvert(), nb::arg("covariance").noconvert(),
       nb::arg("level").noconvert(), nb::arg("slope").noconvert(), nb::arg("unit"));
   bind_stream<T>(m, end);
+  bind_in_order<T>(m, end);
 }
 
 }  // namespace

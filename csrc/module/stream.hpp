@@ -93,14 +93,17 @@ class StreamEngine {
   void observe(double time, const Const<T>& values, const Const<bool>& mask, bool use_prediction) {
     check_shape("values", values, {spec_.channels});
     check_shape("mask", mask, {spec_.channels});
-    run(time, values.data(), mask.data(), use_prediction);
+    take(time, values.data(), mask.data(), use_prediction);
+  }
+  void take(double time, const T* values, const bool* mask, bool use_prediction) {
+    run(time, values, mask, use_prediction);
     now_.state.swap(after_);
     now_.covariance.swap(next_covariance_);
     now_.time = time;
     now_.start = next_start_;
     if (observed_) now_.observed_at = time;
     for (int c = 0; c < spec_.channels; ++c)
-      if (mask.data()[c]) now_.channel_at[c] = time, now_.last[c] = values.data()[c];
+      if (mask[c]) now_.channel_at[c] = time, now_.last[c] = values[c];
     if (observed_ || !spec_.nodes) now_.updated = update_;
     ++now_.rows;
   }
@@ -110,14 +113,22 @@ class StreamEngine {
     check_shape("times", times, {n});
     check_shape("out", out, {n, spec_.channels});
     check_contiguous("out", out);
-    for (int64_t i = 0; i < n; ++i) {
-      const T* state = now_.state.data();
-      if (!time_.last_row) {
-        run(times.data()[i], nullptr, nullptr, false);
-        state = before_.data();
-      }
-      read(state, out.data() + i * spec_.channels);
+    for (int64_t i = 0; i < n; ++i)
+      predict_at(times.data()[i], out.data() + i * spec_.channels);
+  }
+  // The prediction of a row, and its observation. The dynamics run once, as in a batch.
+  void step(double time, const T* values, const bool* mask, double* out) {
+    if (out && time_.last_row) read(now_.state.data(), out);
+    take(time, values, mask, false);
+    if (out && !time_.last_row) read(before_.data(), out);
+  }
+  void predict_at(double time, double* out) {
+    const T* state = now_.state.data();
+    if (!time_.last_row) {
+      run(time, nullptr, nullptr, false);
+      state = before_.data();
     }
+    read(state, out);
   }
 
   void reserve(int64_t slots) {
@@ -156,6 +167,7 @@ class StreamEngine {
     now_.rows = int64_t(rows);
   }
   int64_t rows() const { return now_.rows; }
+  int64_t channels() const { return spec_.channels; }
 
  private:
   struct State {

@@ -114,6 +114,13 @@ class CpuEngine(Engine):
         self._live.predict(times, out)
         return out
 
+    def in_order(self, **settings: Any) -> Any | None:
+        """Compiled code for messages in the order of time; None with self-feeding."""
+        if self._fraction:
+            return None
+        kind = getattr(cpu.compiled, f"InOrder_{cpu.suffix(self._model.dtype)}")
+        return kind(self._live, **settings)
+
     def save(self, slot: int) -> None:
         """Copies the state to a slot."""
         self._live.save(slot)

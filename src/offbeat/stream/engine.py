@@ -69,6 +69,14 @@ class Engine(ABC):
         """
         return None
 
+    def in_order(self, **settings: Any) -> Any | None:
+        """Compiled code that takes messages in the order of time, where the engine has any.
+
+        Args:
+            settings: of `stream/in_order.py`.
+        """
+        return None
+
     @abstractmethod
     def save(self, slot: int) -> None:
         """Copies the state to a slot."""

@@ -49,7 +49,8 @@ class History:
     def forget(self) -> None:
         """Drops all rows; does not change the engine."""
         self.rows: list[Row] = []
-        self._free = list(range(self._undo))
+        self.free = list(range(self._undo))
+        """Slots of the engine without a state."""
         self.floor = -math.inf
         """s, time of the newest row that is no longer kept."""
 
@@ -60,10 +61,10 @@ class History:
 
     def append(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
         """Appends the next row. If the engine raises, nothing changes."""
-        slot = self._free[-1]
+        slot = self.free[-1]
         self._engine.save(slot)
         self._observe(time, values, mask)
-        self._free.pop()
+        self.free.pop()
         self.rows.append(Row(time, values, mask, slot))
         if len(self.rows) > self._kept:
             self._trim()
@@ -125,7 +126,7 @@ class History:
         self.forget()
         self.floor = floor
         for time, row_values, row_mask, before in rows:
-            slot = self._free.pop()
+            slot = self.free.pop()
             self._engine.restore(before)
             self._engine.save(slot)
             self.rows.append(Row(time, row_values, row_mask, slot))
@@ -139,7 +140,7 @@ class History:
         again = [row, *((r.time, r.values, r.mask) for r in self.rows[rest:])]
         self._engine.save(self._undo)
         self._engine.load(self.rows[i].slot)
-        free, made = list(self._free), []
+        free, made = list(self.free), []
         try:
             for time, values, mask in again:
                 slot = free.pop()
@@ -149,7 +150,7 @@ class History:
         except Exception:
             self._engine.load(self._undo)
             raise
-        self._free = free + [old.slot for old in self.rows[i:]]
+        self.free = free + [old.slot for old in self.rows[i:]]
         self.rows[i:] = made
 
     def _observe(self, time: float, values: NDArray[Any], mask: NDArray[np.bool_]) -> None:
@@ -162,7 +163,7 @@ class History:
     def _trim(self) -> None:
         while len(self.rows) > self._kept:
             row = self.rows.pop(0)
-            self._free.append(row.slot)
+            self.free.append(row.slot)
             self.floor = row.time
 
 

@@ -14,6 +14,7 @@ from offbeat.data.trajectory import EXOGENOUS
 from offbeat.data.transforms import Transforms
 from offbeat.errors import DivergenceError, InputError
 from offbeat.stream.engine import Engine
+from offbeat.stream.in_order import InOrder, is_plain
 from offbeat.stream.messages import RowReader, Time, Values
 from offbeat.stream.options import Outcome, StreamCounters, StreamOptions
 from offbeat.stream.placing import Placement
@@ -82,7 +83,10 @@ class LiveStream:
             median_gap=info.median_gap,
             elapsed_limit=info.elapsed_limit,
         )
-        self._clock, self._history = self._placing.clock, self._placing.history
+        self._clock = self._placing.clock
+        self._in_order = InOrder(
+            self._placing, self._reader, self._scaler, options, self._exogenous
+        )
 
     @property
     def time_unit(self) -> str:
@@ -92,17 +96,21 @@ class LiveStream:
     @property
     def time(self) -> Time | None:
         """Time of the newest row, in the unit of the stream; None before the first."""
-        return self._placing.time
+        newest = self._in_order.newest
+        return None if newest is None else self._clock.at(newest)
 
     def after(self, horizon_s: float) -> Time | None:
         """The time `horizon_s` after the newest row; None before the first."""
-        rows = self._history.rows
-        return self._clock.at(self._history.newest + horizon_s) if rows else None
+        newest = self._in_order.newest
+        return None if newest is None else self._clock.at(newest + horizon_s)
 
     @property
     def counters(self) -> StreamCounters:
         """A copy of the counters."""
-        return replace(self._placing.counters)
+        self._in_order.close()
+        counters = replace(self._placing.counters)
+        self._in_order.open()
+        return counters
 
     @property
     def recoveries(self) -> int:
@@ -132,18 +140,10 @@ class LiveStream:
             DivergenceError: an adaptive solver could not reach its tolerance, not even from a reset
                 state.
         """
-        t = self._clock.read(t)
-        row, mask, measured, not_finite = self._reader.read(values)
-        waited = -math.inf if now is None else self._clock.between(self._clock.read(now), t)
-        if waited > (self.options.stale_after_s or math.inf):
-            outcome = self._placing.drop("stale")
-        else:
-            outcome = self._placing.take(t, row, mask, measured)
-        counters = self._placing.counters
-        counters.messages += 1
-        counters.not_finite += not_finite
-        counters.empty += measured == 0
-        return outcome
+        t = t if is_plain(t) else self._clock.read(t)
+        stale = now is not None and self._is_stale(t, now)
+        outcome = None if stale else self._in_order.observe(t, values)
+        return outcome or self._place(t, values, stale=stale)
 
     def step(
         self, t: Time, values: Values, *, now: Time | None = None
@@ -163,6 +163,11 @@ class LiveStream:
             InputError: as `observe`.
             DivergenceError: as `observe` and `predict`.
         """
+        t = t if is_plain(t) else self._clock.read(t)
+        stale = now is not None and self._is_stale(t, now)
+        done = None if stale else self._in_order.step(t, values)
+        if done is not None:
+            return done
         predicted: list[NDArray[np.float64]] = []
 
         def before_row(time: float) -> None:
@@ -170,10 +175,32 @@ class LiveStream:
 
         self._placing.before_row = before_row
         try:
-            outcome = self.observe(t, values, now=now)
+            outcome = self._place(t, values, stale=stale)
         finally:
             self._placing.before_row = None
         return outcome, predicted[-1] if outcome == "new" else None
+
+    def _is_stale(self, t: Time, now: Time) -> bool:
+        waited = self._clock.between(self._clock.read(now), self._clock.read(t))
+        return waited > (self.options.stale_after_s or math.inf)
+
+    def _place(self, t: Time, values: Values, *, stale: bool) -> Outcome:
+        """Consumes any message."""
+        t = self._clock.read(t)
+        row, mask, measured, not_finite = self._reader.read(values)
+        self._in_order.close()
+        try:
+            if stale:
+                outcome = self._placing.drop("stale")
+            else:
+                outcome = self._placing.take(t, row, mask, measured)
+            counters = self._placing.counters
+            counters.messages += 1
+            counters.not_finite += not_finite
+            counters.empty += measured == 0
+        finally:
+            self._in_order.open()
+        return outcome
 
     def predict(self, t: Time | ArrayLike) -> NDArray[np.float64]:
         """Predicts the channels at a time from all observations; does not change the state.
@@ -195,6 +222,8 @@ class LiveStream:
         """
         if isinstance(t, np.ndarray) and t.ndim == 0:
             t = t[()]
+        if is_plain(t) and (quick := self._in_order.predict(t)) is not None:  # type: ignore[arg-type]
+            return quick
         several = isinstance(t, list | tuple | np.ndarray)
         asked = [self._asked(self._clock.read(one)) for one in (t if several else [t])]  # type: ignore[union-attr]
         if not asked:
@@ -242,17 +271,21 @@ class LiveStream:
 
     def reset(self) -> None:
         """Resets the state. The counters keep their values."""
+        self._in_order.close()
         self._placing.reset()
 
     def state(self) -> dict[str, Any]:
         """State of the stream as a JSON-like record; `restore` continues from it bit for bit."""
-        return {
+        self._in_order.close()
+        record = {
             "format": FORMAT,
             "version": VERSION,
             "model": self._engine.fingerprint(),
             "time_unit": self.time_unit,
             **self._placing.record(),
         }
+        self._in_order.open()
+        return record
 
     def restore(self, record: dict[str, Any]) -> None:
         """Continues from a record of `state`. The options of this stream are kept.
@@ -271,7 +304,11 @@ class LiveStream:
             if record.get(key) != expected:
                 got = record.get(key)
                 raise InputError(f"the record is of {key} {got!r}, not {expected!r}; {fix}")
-        self._placing.restore(record)
+        self._in_order.close()
+        try:
+            self._placing.restore(record)
+        finally:
+            self._in_order.open()
 
     def _predict(
         self, times: NDArray[np.float64], *, next_row: bool = False
@@ -284,7 +321,9 @@ class LiveStream:
         """
         predicted = self._engine.predict(times)
         if not np.isfinite(predicted).all():
-            newest = [self._history.newest] if self._history.rows else []
+            self._in_order.close()
+            rows = self._placing.history.rows
+            newest = [rows[-1].time] if rows else []
             if not next_row and np.isfinite(self._engine.predict(np.array(newest))).all():
                 raise DivergenceError(
                     "a prediction is not finite, although the state of the stream is; ask for an "
@@ -301,9 +340,10 @@ class LiveStream:
 
     def _asked(self, t: Time) -> float:
         """A time to predict at, in s."""
-        if not self._history.rows:
+        newest = self._in_order.newest
+        if newest is None:
             return 0.0
-        time, newest = self._clock.seconds(t), self._history.newest
+        time = self._clock.seconds(t)
         if newest - time > self.options.merge_within_s:
             raise InputError(
                 f"asked for the time {t}, {newest - time:g} s before the newest row, of the time "

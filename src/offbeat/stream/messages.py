@@ -121,7 +121,8 @@ class RowReader:
         largest = np.finfo(np.float64).max / 4
         with np.errstate(over="ignore"):
             reach = np.minimum(0.99 * float(np.finfo(dtype).max) * np.abs(scaler.scale), largest)
-        self._low, self._high = scaler.shift - reach, scaler.shift + reach
+        self._low, self._high = self.reach = np.stack([scaler.shift - reach, scaler.shift + reach])
+        """(2, channels) in original units; values between these count as measured."""
 
     def read(self, values: Values) -> tuple[NDArray[Any], NDArray[np.bool_], int, int]:
         """A row (0 where not measured), its mask, and two counts.

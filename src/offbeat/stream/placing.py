@@ -52,7 +52,7 @@ class Placement:
         median_gap: float,
         elapsed_limit: float,
     ) -> None:
-        self._engine, self._options, self._names = engine, options, names
+        self.engine, self._options, self._names = engine, options, names
         self.clock, self.history = (
             Clock(time_unit),
             History(engine, options.kept_rows, self.recover),
@@ -72,7 +72,8 @@ class Placement:
                 f"{median_gap:g} s (and merge_within_s): every row would be a jump"
             )
         limit = options.long_gap_s
-        self._long_gap = elapsed_limit if limit is None else limit
+        self.long_gap = elapsed_limit if limit is None else limit
+        """s without a value; a longer gap counts as long."""
 
     @property
     def time(self) -> Time | None:
@@ -81,7 +82,7 @@ class Placement:
 
     def reset(self) -> None:
         """Resets the state. The counters keep their values."""
-        self._engine.reset()
+        self.engine.reset()
         self.history.forget()
         self.clock.origin = None
         self.pending, self.seen = [], None
@@ -89,7 +90,7 @@ class Placement:
 
     def recover(self) -> None:
         """Resets the engine alone, whose state is no longer finite; time and rows stay."""
-        self._engine.reset()
+        self.engine.reset()
         self.counters.recoveries += 1
         if self.counters.recoveries == 1:
             logging.getLogger("offbeat").warning(
@@ -122,7 +123,7 @@ class Placement:
             InputError: the record is damaged. Nothing changes then.
         """
         channels = len(self._names)
-        values, mask = np.zeros(channels, self._engine.dtype), np.zeros(channels, dtype=bool)
+        values, mask = np.zeros(channels, self.engine.dtype), np.zeros(channels, dtype=bool)
         try:
             origin = None if record["origin"] is None else self.clock.read(record["origin"])
             seen = None if record["seen"] is None else seconds(record["seen"])
@@ -167,7 +168,7 @@ class Placement:
     ) -> Outcome:
         """Appends the next row."""
         gap = time - self.seen if measured and self.seen is not None else 0.0
-        long = gap > self._long_gap
+        long = gap > self.long_gap
         if long and self._options.long_gap == "reset":
             origin, floor = self.clock.origin, self.history.newest
             self.reset()
