@@ -118,8 +118,9 @@ class CpuEngine(Engine):
         """Compiled code for messages in the order of time; None with self-feeding."""
         if self._fraction:
             return None
-        kind = getattr(cpu.compiled, f"InOrder_{cpu.suffix(self._model.dtype)}")
-        return kind(self._live, **settings)
+        # A module that was compiled from older sources has none.
+        kind = getattr(cpu.compiled, f"InOrder_{cpu.suffix(self._model.dtype)}", None)
+        return kind and kind(self._live, **settings)
 
     def save(self, slot: int) -> None:
         """Copies the state to a slot."""

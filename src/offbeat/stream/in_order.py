@@ -81,9 +81,7 @@ class InOrder:
         """
         return None if self._loop is None else _OUTCOMES[self._loop.observe(t, values, None)]
 
-    def step(
-        self, t: Time, values: Values
-    ) -> tuple[Outcome, NDArray[np.float64] | None] | None:
+    def step(self, t: Time, values: Values) -> tuple[Outcome, NDArray[np.float64] | None] | None:
         """Predicts a row, (channels,) in original units, and observes it; None refuses it.
 
         Args:
