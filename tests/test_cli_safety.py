@@ -169,3 +169,18 @@ def test_completion_of_other_shells_knows_commands_options_and_choices(shell):
     )
     for word in ("forecast", "extrapolate", "--two_sided", "--reader.time_unit", "dropout"):
         assert word in found.stdout
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ("max_gap_s=abc", "--reader.max_gap_s must be float, Literal['auto'], null, got abc"),
+        ("units=abc", "--reader.units must be Mapping[str, str], null, got abc"),
+        ("order=[1]", "--reader.order must be Literal['sort', 'drop', 'refuse'], got [1]"),
+        (f"min_rows={'a' * 5000}", f"--reader.min_rows must be int, got {'a' * 60}..."),
+    ],
+)
+def test_an_option_of_a_wrong_type_is_one_short_line(option, expected, tmp_path, capsys):
+    (tmp_path / "log.csv").write_text("time,x\n0,1\n1,2\n")
+    assert app.main(["inspect", str(tmp_path / "log.csv"), f"--reader.{option}"]) == 2
+    assert capsys.readouterr().err == f"offbeat: error: {expected}\n"

@@ -7,6 +7,7 @@ import gzip
 import json
 import lzma
 import struct
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,60 @@ def test_a_marker_of_a_missing_value_is_one_wherever_it_is(text, tmp_path):
         assert np.flatnonzero(np.isnan(dataset[0].values[:, 0])).tolist() == [row]
 
 
+@pytest.mark.parametrize("name", tables.GROUPS)
+def test_a_header_in_several_lines_names_every_channel(name, tmp_path):
+    content, options, names, units = tables.GROUPS[name]
+    (tmp_path / "log.csv").write_text(content)
+    (trajectory,) = dataset = read(tmp_path / "log.csv", **options)
+    assert (dataset.names, dataset.units) == (names, units)
+    assert trajectory.times == pytest.approx(tables.TIMES, abs=1e-12)
+    column = next(i for i, n in enumerate(names) if n.casefold().endswith(".x"))
+    assert trajectory.values[:, column].tolist() == tables.X.tolist()
+    assert "completed by the lines above it" in notes(dataset)
+
+
+@pytest.mark.parametrize("words", [("yes", "no"), ("ON", "Off"), ("0x1", "0X0")])
+def test_switches_and_hexadecimal_numbers_are_numbers(words, tmp_path):
+    rows = [f"{i},{words[i % 2]}" for i in range(40)]
+    (tmp_path / "log.csv").write_text("time_ms,c\n" + "\n".join(rows) + "\n")
+    dataset = read(tmp_path / "log.csv")
+    assert dataset[0].values[:, 0].tolist() == [float(i % 2 == 0) for i in range(40)]
+    (tmp_path / "log.csv").write_text("time_ms,c\n" + "\n".join([*rows, "40,auto", "41,7"]) + "\n")
+    if words[0] == "0x1":
+        with pytest.raises(FileFormatError, match="has 'auto' in line 42"):
+            read(tmp_path / "log.csv")
+    else:  # a word that is no switch makes it a column of text
+        with pytest.raises(FileFormatError, match="no column of numbers besides the time"):
+            read(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("scale", [3, 9])
+def test_times_of_parquet_may_be_decimals(scale, tmp_path):
+    stamps = [Decimal(1_764_000_000) + Decimal(i) / 1000 for i in range(tables.ROWS)]
+    columns = {"time": pa.array(stamps, pa.decimal128(19, scale)), **tables.XY}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    dataset = read(tmp_path / "log.parquet")
+    assert dataset[0].times.tolist() == [i / 1000 for i in range(tables.ROWS)]
+    assert dataset.meta["time_unit"] == "s"
+
+
+def test_an_index_of_pandas_that_increases_is_the_time_where_no_column_is(tmp_path):
+    columns = {"x": tables.X, "__index_level_0__": tables.TIMES}
+    pq.write_table(pa.table(columns), tmp_path / "log.parquet")
+    dataset = read(tmp_path / "log.parquet")
+    assert dataset.names == ("x",)
+    assert dataset[0].times == pytest.approx(tables.TIMES)
+    assert "index of pandas is taken for the time" in notes(dataset)
+
+
+def test_times_of_numpy_may_be_a_column(tmp_path):
+    matrix = np.column_stack([tables.X, tables.Y])
+    np.savez(tmp_path / "log.npz", time=tables.TIMES[:, None], q=matrix)
+    dataset = read(tmp_path / "log.npz")
+    assert dataset[0].times == pytest.approx(tables.TIMES)
+    assert dataset[0].values.tolist() == matrix.tolist()
+
+
 @pytest.mark.parametrize("empty", [3, 1200])
 def test_booleans_are_numbers_wherever_they_begin(empty, tmp_path):
     rows = [f"{i},{'' if i < empty else ('True', 'False')[i % 2]}" for i in range(empty + 50)]
@@ -260,6 +315,24 @@ class TestABag:
         assert default.names == ("foot_force[0]", "foot_force[1]")
         assert "motor_state (a list of messages, unless chosen" in notes(default)
 
+    def test_with_a_list_of_named_messages_goes_by_their_names(self, form, tmp_path):
+        path = logs.named_motors(tmp_path, form)
+        dataset = read(path, fields=["joints"])
+        assert sorted(dataset.names) == ["joints.hip.q", "joints.knee.q"]
+        for k, name in enumerate(("joints.hip.q", "joints.knee.q")):
+            column = dataset[0].values[:, dataset.names.index(name)]
+            assert column == pytest.approx(logs.X + k)
+        assert read(path, fields=["joints[0].q"]).names == ("joints[0].q",)
+
+    def test_whose_frame_changes_all_the_time_is_one_signal_in_the_order_of_receipt(
+        self, form, tmp_path
+    ):
+        dataset = read(logs.poses_in_many_frames(tmp_path, form))
+        (trajectory,) = dataset
+        assert trajectory.values[:, 0].tolist() == list(range(400))
+        assert dataset.meta["cleaning"]["order"]["late"] == 0
+        assert "the frame changes between 200" in notes(dataset)
+
     def test_with_a_frame_of_two_parents_has_a_signal_for_each(self, form, tmp_path):
         (trajectory,) = dataset = read(logs.transforms(tmp_path, form))
         for start, parent, ahead in ((0, "odom", 0.0), (1, "map", 100.0)):
@@ -374,6 +447,21 @@ class TestHdf5:
             InputError, match="unknown time_column 'when', expected one of: actions"
         ):
             read(path, time_column="when")
+
+    def test_counts_in_the_unit_that_its_times_have_as_an_attribute(self, tmp_path):
+        path = logs.robomimic(tmp_path / "log.hdf5", times="time")
+        with h5py.File(path, "a") as file:
+            for demo in file["data"].values():
+                demo["time"].attrs["units"] = "ms"
+        assert read(path)[0].times == pytest.approx(logs.TICKS / 1e12)
+
+    def test_with_times_in_some_demonstrations_alone_is_refused(self, tmp_path):
+        path = logs.robomimic(tmp_path / "log.hdf5", times="time")
+        with h5py.File(path, "a") as file:
+            del file["data/demo_1/time"]
+        with pytest.raises(FileFormatError, match="has times in demo_0 and none in demo_1"):
+            read(path)
+        assert read(path, rate_hz=50)[1].times == pytest.approx(logs.TICKS / 1e9)
 
     def test_leaves_out_an_empty_demonstration_and_says_so(self, tmp_path):
         dataset = read(logs.robomimic(tmp_path / "log.hdf5", empty=True))

@@ -52,6 +52,35 @@ def motor_states(folder, form):
     return write_bag(folder, form, messages, store)
 
 
+def named_motors(folder, form):
+    """A list of messages with names, whose order changes."""
+    base = Stores.ROS1_NOETIC if form == "bag" else Stores.ROS2_HUMBLE
+    store = logs.custom_store(
+        base, Joint="string name\nfloat64 q", Arm="test_msgs/Joint[] joints\nfloat64 v"
+    )
+    types = store.types
+    messages = []
+    for i, (t, x) in enumerate(zip(TICKS, X, strict=True)):
+        joints = [types["test_msgs/msg/Joint"](n, x + k) for k, n in enumerate(("hip", "knee"))]
+        arm = types["test_msgs/msg/Arm"](joints[:: -1 if i % 2 else 1], x)
+        messages.append(("/arm", START + int(t), arm))
+    return write_bag(folder, form, messages, store)
+
+
+def poses_in_many_frames(folder, form, frames=200):
+    """Poses of two rows a frame, each row 2 s after the one before."""
+    store = base_store(form)
+    stamps = [START + 2 * S * i for i in range(2 * frames)]
+    return write_bag(
+        folder,
+        form,
+        [
+            ("/pose", t, logs.pose_message(store, t, [i, 0, 0, 0, 0, 0, 1], f"f{i % frames}"))
+            for i, t in enumerate(stamps)
+        ],
+    )
+
+
 def transforms(folder, form, parents=("odom", "map")):
     """A child frame of two parents, in turns: 100 m ahead in the second."""
     store = base_store(form)

@@ -347,6 +347,60 @@ TEXTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
 }  # fmt: skip
 """Forms of one table as text: what is written, options, and a note that is expected."""
 
+ROWS_OF_TEXT = BODY.split()
+TEXTS |= {
+    "a table of LabVIEW": (
+        "LabVIEW Measurement\nSeparator,Comma\nDate,2025/11/24\nTime,13:10:34.02\n"
+        "***End_of_Header***,,\nChannels,2,\nSamples,40,40\nX0,0.0,0.0\nDelta_X,0.02,0.02\n"
+        "***End_of_Header***,,\nX_Value,x,y\n" + BODY, {}, "",
+    ),
+    "columns without a name or a field": (
+        ",time,x,y\n" + "".join(f",{row}\n" for row in ROWS_OF_TEXT), {},
+        "has no name and no field",
+    ),
+    "durations of pandas": (
+        ",x,y\n" + "".join(
+            f"-1 days +23:59:59.{i * 20:03d}000,{row.partition(',')[2]}\n"
+            for i, row in enumerate(ROWS_OF_TEXT)
+        ), {}, "is taken for the time",
+    ),
+    "dates of MATLAB": (
+        "time,x,y\n" + "".join(
+            f"24-Nov-2025 23:59:59.{i * 20:03d},{row.partition(',')[2]}\n"
+            for i, row in enumerate(ROWS_OF_TEXT)
+        ), {}, "",
+    ),
+    "exponents of Fortran": (
+        "time,x,y\n" + "".join(
+            f"{t:.2f},{f'{x:.6E}'.replace('E', 'D')},{f'{y:.6E}'.replace('E', 'd')}\n"
+            for t, x, y in zip(TIMES, X, Y, strict=True)
+        ), {}, "",
+    ),
+}  # fmt: skip
+
+GROUPS: dict[str, tuple[str, dict[str, Any], tuple[str, ...], tuple[str, ...]]] = {
+    "Motive": (
+        "Format Version,1.23,Length Units,Meters\n\n,Type,Rigid Body,Rigid Body\n,Name,Foot,Hip\n"
+        ",ID,1,2\n,,Position,Position\nFrame,Time (Seconds),X,X\n"
+        + "".join(f"{i},{t:.2f},{x},{y}\n" for i, (t, x, y) in enumerate(
+            zip(TIMES, X, Y, strict=True))),
+        {}, ("Frame", "Foot.X", "Hip.X"), ("", "", ""),
+    ),
+    "Vicon": (
+        "Trajectories\n50\n,,Robot:toe,,Robot:heel,\nFrame,Sub Frame,X,Y,X,Y\n,,mm,mm,mm,mm\n"
+        + "".join(f"{i},0,{x},{y},{y},{x}\n" for i, (x, y) in enumerate(zip(X, Y, strict=True))),
+        {"rate_hz": 50},
+        ("Frame", "Sub Frame", "Robot:toe.X", "Robot:toe.Y", "Robot:heel.X", "Robot:heel.Y"),
+        ("", "", "mm", "mm", "mm", "mm"),
+    ),
+    "a MultiIndex of pandas": (
+        ",imu,imu,gps\n,x,y,x\ntime,,,\n"
+        + "".join(f"{t:.2f},{x},{y},1\n" for t, x, y in zip(TIMES, X, Y, strict=True)),
+        {}, ("imu.x", "imu.y", "gps.x"), ("", "", ""),
+    ),
+}  # fmt: skip
+"""Texts whose header stands in several lines: content, options, names and units."""
+
 MISSING_TEXTS = (
     *("", "-", "--", "?", "nan", "NaN", "-nan", "NA", "N/A", "null", "None", "NaN(ind)"),
     *("-nan(ind)", "1.#IND", "-1.#IND", "1.#QNAN", "#N/A", "#DIV/0!"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+import re
 import sys
 import time
 import traceback
@@ -222,7 +223,22 @@ def _missing(error: ModuleNotFoundError) -> int:
     )
 
 
+_LONGEST = 500  # characters of a message, as paths may be long
+_OF_PARSER = re.compile(
+    r'Parser key "([^"]+)": (?:Does not validate against any of the Union subtypes Subtypes: '
+    r"\[(.*?)\] Errors: .* Given value: (.*)|Expected an? (.*?)\. Got value: (.*))"
+)
+
+
 def _fail(message: str, code: int) -> int:
     line = printable(" ".join(message.split()))
+    if found := _OF_PARSER.fullmatch(line):
+        key, several, given, one, other = found.groups()
+        expected = re.sub(r"typing\.|collections\.abc\.|<class '([^']*)'>", r"\1", several or one)
+        expected = expected.replace("collections.abc.", "").replace("NoneType", "null")
+        value = given if given is not None else other
+        line = f"--{key} must be {expected}, got {value[:60]}{'...' if len(value) > 60 else ''}"
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST - 110]} ... {line[-100:]}"
     print(f"offbeat: error: {line}", file=sys.stderr)
     return code

@@ -222,9 +222,9 @@ def _ordered(
         if lost > max(_FEW, before // _ONE_IN):
             raise FileFormatError(
                 f"{_where(signal, recording)}{lost} of {before} rows have the time stamp of "
-                "another row and other values. Name the column of the time (time_column=), of the "
-                "sensor of each row (instance_column=) or of its trajectory (trajectory_column=); "
-                "duplicates=last (or first, mean) merges such rows"
+                "another row and other values. Name the column of the time, or of the sensor or "
+                "trajectory of each row (time_column=, instance_column=, trajectory_column=; of a "
+                "bag stamps=receive); duplicates=last (or first, mean) merges such rows"
             )
     stamps, values = anomalies.one_row_per_stamp(stamps, values, options.duplicates)
     if before > len(stamps):

@@ -480,7 +480,10 @@ def _instance_column(
     # Of stamps in whole seconds, a column may count the rows of each second.
     coarse = stamp.rest is None and times.size and bool((np.diff(times) % 1 == 0).all())
     shared = 5 * (len(stamps) - len(set(stamps))) >= len(stamps)  # not by chance
-    for name in rest:
+    usual_first = sorted(
+        rest, key=lambda n: (folded(n) not in KEY_NAMES, folded(n) not in INSTANCE_NAMES)
+    )
+    for name in usual_first:
         usual = folded(name)
         texts = sample.texts(name)
         different = set(texts)

@@ -19,6 +19,11 @@ MISSING = (
 """Fields whose value is not known."""
 
 BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
+SWITCHES = {"yes": 1, "no": 0, "on": 1, "off": 0}
+"""Words for 1 and 0, in any case, in a column that holds no others."""
+
+_HEX = re.compile(r"0[xX][0-9a-fA-F]{1,13}")
+_FORTRAN = r"^([+-]?[0-9]*\.?[0-9]+|[+-]?[0-9]+\.)[dD]([+-]?[0-9]+)$"
 
 _NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$|^[+-]?(inf|infinity|nan)$"
 _INFINITE = r"^([+-]?)1\.#(INF|inf).*$"
@@ -40,8 +45,12 @@ def number_in(text: str, decimal: str) -> float | None:
     try:
         number = float(text)
     except ValueError:
-        infinite = re.match(_INFINITE, text.strip())
-        return float(f"{infinite[1]}inf") if infinite else None
+        text = text.strip()
+        if infinite := re.match(_INFINITE, text):
+            return float(f"{infinite[1]}inf")
+        if fortran := re.match(_FORTRAN, text):
+            return float(f"{fortran[1]}e{fortran[2]}")
+        return float(int(text, 16)) if _HEX.fullmatch(text) else None
     # Python allows _ between digits, and digits of other scripts; CSV does not.
     return number if text.isascii() and "_" not in text else None
 
@@ -115,8 +124,16 @@ class Converter:
         import pyarrow.compute as pc
 
         lower = pc.utf8_lower(texts)
-        texts = pc.if_else(pc.equal(lower, "true"), "1", texts)
-        texts = pc.if_else(pc.equal(lower, "false"), "0", texts)
+        switches = pc.all(pc.is_in(lower.drop_null(), pa.array([*SWITCHES]))).as_py()
+        words = {"true": 1, "false": 0, **(SWITCHES if switches else {})}
+        for word, number in words.items():
+            texts = pc.if_else(pc.equal(lower, word), str(number), texts)
+        texts = pc.replace_substring_regex(texts, _FORTRAN, r"\1e\2")
+        if pc.any(pc.starts_with(lower, "0x")).as_py():
+            texts = pa.array(
+                [str(int(t, 16)) if t and _HEX.fullmatch(t) else t for t in texts.to_pylist()],
+                pa.string(),
+            )
         texts = pc.replace_substring_regex(texts, _INFINITE, r"\1inf")
         if self.decimal == ".":
             grouped = pc.match_substring_regex(texts, _THOUSANDS)

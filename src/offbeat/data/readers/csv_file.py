@@ -18,7 +18,13 @@ from offbeat.data.cleaning.clocks import NANOSECONDS_PER, time_column_of
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullValueError, gather, line_error, with_joined
 from offbeat.data.readers.columns import Columns
-from offbeat.data.readers.csv_fields import BOOLEANS, GROUPED_BY_POINTS, Converter, number_in
+from offbeat.data.readers.csv_fields import (
+    BOOLEANS,
+    GROUPED_BY_POINTS,
+    SWITCHES,
+    Converter,
+    number_in,
+)
 from offbeat.data.readers.csv_layout import CsvLayout, is_comment
 from offbeat.data.readers.csv_streams import Spaced, Without, with_count, with_dates, without_empty
 from offbeat.data.readers.gathered import Coded, Gathered
@@ -52,8 +58,10 @@ class CsvSample:
     def is_text(self, name: str) -> bool:
         """Whether most of its known fields are neither numbers nor booleans."""
         known = [f for f in self.fields[name] if f and f not in self.file.missing]
-        others = sum(f not in BOOLEANS and self.file.number(f) is None for f in known)
-        return 2 * others > len(known)
+        words = [f for f in known if self.file.number(f) is None and f not in BOOLEANS]
+        if len(words) == len(known) and all(f.casefold() in SWITCHES for f in words):
+            return False
+        return 2 * len(words) > len(known)
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """The known numbers of a column; empty if a field is none."""
@@ -103,7 +111,10 @@ class CsvFile:
         if not names[0] or names[0] == "Unnamed: 0":
             first = [fields[0].strip() for _, fields in itertools.islice(self._rows(), _SAMPLE)]
             names[0] = ""
-            if _counts(first):
+            if not any(first) and len(names) > 1:
+                notes.append("the first column has no name and no field in the first lines; it is "
+                             "left out")  # fmt: skip
+            elif _counts(first):
                 notes.append("the first column has no name and counts the rows; it is left out")
             elif first and not time_column_of(names[1:]) and all(map(_is_time, first)):
                 names[0] = "time"

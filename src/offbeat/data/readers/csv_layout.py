@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from offbeat.data.cleaning.clocks import TIME_NAMES, folded, is_unit
+from offbeat.data.cleaning.clocks import TIME_NAMES, folded, is_unit, time_column_of
 from offbeat.data.readers.stamps import form_of
 from offbeat.data.readers.text import TextFile
 from offbeat.errors import FileFormatError
@@ -31,6 +31,8 @@ _TYPES = frozenset(  # words in a line of types below a header
 )
 _LINES = 200  # in which the table must begin
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
+_END = "***End_of_Header***"  # of LabVIEW, whose lines of description hold numbers, too
+_GROUPS = 6  # lines above a header that may complete its names
 _SEPARATOR = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)
 
 Row = tuple[int, list[str]]
@@ -79,6 +81,9 @@ def find_csv_layout(
     first = next(file.lines(), "")
     if match := _SEPARATOR.fullmatch(first.strip("\ufeff")):
         start, delimiter = 1, delimiter or match[1]
+    for number, line in enumerate(itertools.islice(file.lines(), _LINES), 1):
+        if line.startswith(_END):
+            start = number
     found: list[CsvLayout] = []
     for tried in DELIMITERS if delimiter is None else (delimiter,):
         rows = [row for row in itertools.islice(file.rows(tried), _LINES) if row[0] > start]
@@ -134,6 +139,10 @@ def _layout(
     head = above
     names = _names(rows[head][1], delimiter)
     notes: list[str] = []
+    grouped = _grouped(rows, head, names)
+    if grouped != names:
+        names = grouped
+        notes.append("names of the header are completed by the lines above it")
     if units:
         names = tuple(
             f"{name} [{unit}]" if unit.strip("-") and name else name
@@ -147,6 +156,37 @@ def _layout(
         notes.append(f"the header is line {rows[head][0]}; lines above it are left out")
     first = rows[at - 1][0] + 1
     return CsvLayout(delimiter, names, rows[head][0], first, tuple(notes)), len(names) == width
+
+
+def _grouped(rows: list[Row], head: int, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names with those of groups from the lines above, where they would be empty or equal.
+
+    Motion capture writes the body and the quantity above `X`, `Y` and `Z`, pandas the outer levels
+    of a `MultiIndex`. A group holds up to the next one; a line that is equal in all columns, or
+    holds numbers, tells nothing apart.
+    """
+    twice = {name for name in names if names.count(name) > 1 or not name}
+    if not twice or (names[-1:] == ("",) and names.count("") == 1 and len(twice) == 1):
+        return names
+    above: list[list[str]] = []
+    below = rows[head][0]
+    for number, fields in reversed(rows[max(0, head - _GROUPS) : head]):
+        if number != below - 1 or len(fields) != len(names) or is_comment(fields[0]):
+            break
+        below = number
+        filled: list[str] = []
+        for text in map(str.strip, fields):
+            filled.append(text or (filled[-1] if filled else ""))
+        under = [f for f, name in zip(filled, names, strict=True) if name in twice and f]
+        if len(set(under)) > 1 and not all(_NUMBER.fullmatch(f) for f in under):
+            above.insert(0, filled)
+    made = [
+        ".".join(part for part in (*(line[i] for line in above), name) if part)
+        if name in twice or (i and name and time_column_of([name]) is None)
+        else name
+        for i, name in enumerate(names)
+    ]
+    return tuple(made) if above and len(set(made)) == len(made) else names
 
 
 def _body(rows: list[Row], at: int, width: int) -> list[Row]:

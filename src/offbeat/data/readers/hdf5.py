@@ -32,6 +32,7 @@ from offbeat.data.cleaning.clocks import (
     split_stamps,
     state_time_unit,
     time_column_of,
+    time_unit_in,
     to_nanoseconds,
 )
 from offbeat.data.cleaning.options import is_number
@@ -127,13 +128,24 @@ def recordings(
         if mask is not None:
             episodes = _masked(file, mask, episodes, path)
         rate, notes = _rate(root, path, rate_hz, robomimic=robomimic)
+        timed: dict[bool, str] = {}
         for name in episodes:
             observations = _observations(root[name], path, robomimic=robomimic)
-            yield _episode(
+            made = _episode(
                 root[name], observations, path, notes,
                 keys=keys, actions=include_actions, rate=rate,
                 time_column=time_column, time_unit=time_unit, given_rate=rate_hz is not None,
             )  # fmt: skip
+            if made.signals:
+                timed.setdefault(
+                    any(n.startswith("stamps are the array") for n in made.notes), name
+                )
+            if len(timed) > 1:
+                raise FileFormatError(
+                    f"{path} has times in {timed[True]} and none in {timed[False]}; state rate_hz= "
+                    "for all, or leave out those without times"
+                )
+            yield made
 
 
 @contextmanager
@@ -157,6 +169,7 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from None
 
 
+_TIMED = ("stamps are the array", "stamps are joined")  # notes of episodes that have times
 _HEAP = b"GCOL\1\0\0\0"
 """Begin of a global heap, which holds texts of any length; lengths and objects follow."""
 
@@ -445,7 +458,9 @@ def _clock(
         _check_storage(array, path)
     first, *rest = times
     if not rest:
-        return (first, times[first][()].reshape(-1)), unit
+        stated = times[first].attrs.get("units", times[first].attrs.get("unit", ""))
+        stated = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else stated
+        return (first, times[first][()].reshape(-1)), unit or time_unit_in(f"t [{stated!s:.20}]")
     (_, _, of_rest), *_ = (
         pair for pair in split_stamps([*times]) if [*pair[:2]] == [first, rest[0]]
     )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import join_stamp, state_time_unit
+from offbeat.data.cleaning.clocks import join_stamp, state_time_unit, time_column_of
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import LABEL_NAMES, Columns, TableOptions, stamp_columns
 from offbeat.data.readers.gathered import Coded, Coder, Gathered, recordings
@@ -47,7 +47,8 @@ def read_npz(
     channels: an array of shape (rows,) gives its name, the columns of one of shape (rows, k) are
     `array.0`, `array.1`, ..., or named by an array `names` of k texts if there is one matrix;
     `units` is used in the same way. Or times have shape (episodes, rows), and the others one axis
-    more; rows whose time is NaN are padding. Other arrays are left out, which is noted.
+    more; rows whose time is NaN are padding. Times of shape (rows, 1) count as (rows,). Other
+    arrays are left out, which is noted.
 
     Args:
         path: the file.
@@ -87,6 +88,10 @@ def read_npz(
         instance_column=instance_column,
         rate_hz=rate_hz,
     )
+    for name, array in arrays.items():
+        column = array.shape[1:] == (1,) and len(array) > 1 and time_column in (None, name)
+        if column and time_column_of([name]):
+            arrays[name] = array[:, 0]
     stamp = stamp_columns(path, list(arrays), options, _NpzSample(arrays), "array")
     shape = arrays[stamp.time].shape if stamp.time else _most_common_length(arrays)
     if len(shape) not in (1, 2) or (stamp.time and arrays[stamp.time].dtype.kind not in "iufmMSU"):

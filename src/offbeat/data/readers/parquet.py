@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import state_time_unit, time_column_of
+from offbeat.data.cleaning.clocks import NANOSECONDS_PER, state_time_unit, time_column_of
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import (
     NullValueError,
@@ -111,10 +111,10 @@ def read_parquet(
                 )
             if channels is None:
                 _check_names(path, schema, schema.names)
-            index = _index_of_times(schema)
-            if time_column is None and rate_hz is None and index is not None:
-                options = replace(options, time_column=index)
             chunks = functools.partial(_chunks, file)
+            index = _index_of_times(schema, chunks) if time_column is None else None
+            if rate_hz is None and index is not None:
+                options = replace(options, time_column=index)
             sample = _ParquetSample(schema, chunks)
             columns = Columns.of(path, _names(schema, options.time_column), options, sample)
             _check_types(path, schema, columns)
@@ -130,6 +130,8 @@ def read_parquet(
             found = False
             kind = schema.field(columns.time).type if columns.time else None
             form = _form(path, columns, sample) if columns.time and is_text(kind) else None
+            shown = ""
+            of_clock: Callable[[str], Iterator[Any]] = chunks
             if not columns.time or columns.rest or is_text(kind) or _is_day(kind):
                 unit = "ns"
             elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
@@ -138,10 +140,14 @@ def read_parquet(
                 numbers = next(chunks(columns.time)).drop_null()
                 numbers = numbers.cast(pa.float64(), safe=False).to_numpy()
                 unit, notes, found = state_time_unit(time_unit, columns.time, numbers, str(path))
+                if pa.types.is_decimal(kind):
+                    shown, unit, of_clock = unit, *_decimals(unit, chunks)
+            if index is not None and columns.time == index:
+                notes = (*notes, "the index of pandas is taken for the time")
             width = sum(widths.get(name, 1) for name in columns.channels)
             require_rows(path, rows, width)
             if columns.time:
-                clock = clock_of_columns(chunks, columns, form)
+                clock = clock_of_columns(of_clock, columns, form)
             else:
                 clock = np.rint(np.arange(rows) * (1e9 / (rate_hz or 1.0))).astype(np.int64)
             sources = [chunks]
@@ -160,7 +166,7 @@ def read_parquet(
             f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
             f"({str(message).removeprefix(f'{path}: ')}); copy it again"
         ) from None
-    return recordings(path, _spread(columns, widths), unit, notes, table, found=found)
+    return recordings(path, _spread(columns, widths), unit, notes, table, shown=shown, found=found)
 
 
 @dataclass(frozen=True)
@@ -229,13 +235,32 @@ def _names(schema: Any, time_column: str | Sequence[str] | None) -> list[str]:
     return [name for name in schema.names if name != _INDEX or name in wanted]
 
 
-def _index_of_times(schema: Any) -> str | None:
+def _index_of_times(schema: Any, chunks: Callable[[str], Iterator[Any]]) -> str | None:
+    """The index of pandas, if no column is a time, and it holds times or numbers that increase."""
     import pyarrow as pa
 
     if _INDEX not in schema.names or time_column_of(list(schema.names)) is not None:
         return None
     kind = schema.field(_INDEX).type
-    return _INDEX if pa.types.is_timestamp(kind) or pa.types.is_duration(kind) else None
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        return _INDEX
+    if not pa.types.is_floating(kind):
+        return None
+    first = next((c for c in chunks(_INDEX) if len(c)), pa.array([], kind))
+    steps = np.diff(first.cast(pa.float64()).to_numpy(zero_copy_only=False))
+    return _INDEX if len(steps) and bool((steps >= 0).all()) else None
+
+
+def _decimals(
+    unit: str, chunks: Callable[[str], Iterator[Any]]
+) -> tuple[str, Callable[[str], Iterator[Any]]]:
+    """The unit of times in decimals once they are converted, and the function that does it."""
+    import pyarrow as pa
+
+    places = len(str(NANOSECONDS_PER[unit])) - 1
+    exact = NANOSECONDS_PER[unit] == 10**places  # those of minutes, hours and days are not
+    kind = pa.decimal128(38, places) if exact else pa.float64()
+    return "ns" if exact else unit, lambda name: (c.cast(kind) for c in chunks(name))
 
 
 def _is_day(kind: Any) -> bool:
@@ -269,7 +294,7 @@ def _check_types(path: Path, schema: Any, columns: Columns) -> None:
         return
     kind = schema.field(columns.time).type
     times = (pa.types.is_timestamp, pa.types.is_duration, pa.types.is_integer, pa.types.is_floating)
-    if not any(fits(kind) for fits in (*times, _is_day, is_text)):
+    if not any(fits(kind) for fits in (*times, pa.types.is_decimal, _is_day, is_text)):
         raise FileFormatError(
             f"{path} has {kind} in column {columns.time!r}, expected times: numbers, time stamps "
             "or durations; say which column is the time with time_column="

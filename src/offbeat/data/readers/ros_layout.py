@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,7 @@ _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _TRANSFORM = "geometry_msgs/msg/TransformStamped"
 _QUATERNION = "geometry_msgs/msg/Quaternion"
 _NAMES = ("name", "names", "joint_names")
+_LABELS = ("name", "joint_name", "label")  # of a message in a list
 
 # Units from the definitions of the messages, or from REP 103.
 _UNITS = {
@@ -237,6 +238,7 @@ class _Parser:
         self.rows: list[Row] = []
         self.skipped: dict[str, str] = {}
         self.available: list[str] = []
+        self.labels: dict[str, str] = {}  # names of the messages of lists
         if cdr:
             if len(message) < 4 or message[0] != 0 or message[1] > 1:
                 raise FileFormatError(
@@ -270,7 +272,10 @@ class _Parser:
                     self.message(what, here, row, unit_here)
             elif node == _BASE and what[0] not in _CODES:
                 is_frame = here in ("header.frame_id", "child_frame_id")
-                text = self._string(what[0], keep=is_frame)
+                is_label = name in _LABELS and path.endswith("]")
+                text = self._string(what[0], keep=is_frame or is_label)
+                if is_label:
+                    self.labels[path] = text
                 if is_frame and (name == "frame_id" or kind != _TRANSFORM):
                     row.frames = (*row.frames, text)
                 if not here.startswith("header."):
@@ -305,11 +310,22 @@ class _Parser:
     def _messages(self, kind: str, here: str, count: int, row: Row) -> None:
         """Parses a list of messages: separate rows if they are transforms.
 
-        Others are left out by default; those that are selected have channels `here[0].x`.
+        Others are left out by default; those that are selected have channels `here[0].x`, or
+        `here.hip.x` where all messages of the list have a name, as their order may change.
         """
         if kind != _TRANSFORM and self.wanted is not None and count <= _MOST_MESSAGES:
+            first = len(row.columns)
             for i in range(count):
                 self.message(kind, f"{here}[{i}]", row, "")
+            labels = {self.labels.get(f"{here}[{i}]", ""): f"{here}[{i}]." for i in range(count)}
+            if len(labels) == count and all(labels) and self.wanted(here):
+                for label, start in labels.items():
+                    row.columns[first:] = [
+                        replace(c, name=f"{here}.{label}.{c.name[len(start) :]}")
+                        if c.name.startswith(start)
+                        else c
+                        for c in row.columns[first:]
+                    ]
             if count:
                 self.available.append(here)
             return

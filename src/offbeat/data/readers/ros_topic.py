@@ -218,9 +218,11 @@ class Topic:
             return
         names = self._names(notes)
         for key, name in names.items():
+            if key not in self.parts:
+                continue
             parts = self.parts.pop(key)
-            # Rows of several frames are in the order of the log only together.
-            for other in [k for k, n in names.items() if n == name and k in self.parts]:
+            others = [k for k, n in names.items() if n == name and k in self.parts]
+            for other in others:
                 parts += self.parts.pop(other)
             columns = {c.name: c for part in parts for c in part.columns}
             rows = sum(len(part.order) for part in parts)
@@ -235,10 +237,13 @@ class Topic:
                 stamps[first:last] = taken
                 if len(part.columns) < len(columns):
                     values[first:last] = np.nan
-                order = [place[c.name] for c in part.columns]
-                values[first:last, order] = part.values
+                at = [place[c.name] for c in part.columns]
+                values[first:last, at] = part.values
                 part.values = np.empty((0, 0))
                 first = last
+            if others:  # rows of several frames are in the order of the log only by their receipt
+                order = np.argsort(np.concatenate([p.received for p in parts]), kind="stable")
+                stamps, values = stamps[order], np.asfortranarray(values[order])
             yield Signal(
                 name,
                 stamps,

@@ -12,12 +12,18 @@ from numpy.typing import NDArray
 
 EXAMPLE = "2026-11-24T21:00:00.5Z"
 
-_DATE = r"(\d{4})[-/](\d\d)[-/](\d\d)|(\d\d)\.(\d\d)\.(\d{4})"
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+_DATE = (
+    r"(\d{4})[-/](\d\d)[-/](\d\d)|(\d\d)\.(\d\d)\.(\d{4})"
+    rf"|(\d\d)-({'|'.join(_MONTHS)})-(\d{{4}})"
+)
 _CLOCK = r"\d\d(?::\d\d(?::\d\d(?:[.,]\d{1,9})?)?)?"
 _OFFSET = r"Z|[+-](?:[01]\d|2[0-3])(?::?[0-5]\d)?| ?UTC"
 _STAMP = re.compile(rf"(?:{_DATE})(?:[T ]({_CLOCK})({_OFFSET})?)?")
 _OF_DAY = re.compile(
-    r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9}))?(?: ?([AaPp])\.?[Mm]\.?)?", re.ASCII
+    r"(?:-?\d{1,6} days?,? \+?)?"
+    r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9}))?(?: ?([AaPp])\.?[Mm]\.?)?",
+    re.ASCII,
 )
 _YEARS = range(1678, 2262)  # of which an int64 of nanoseconds since 1970 holds all of
 _DAY = 86_400 * 10**9
@@ -28,16 +34,17 @@ def form_of(field: str) -> str | None:
 
     A time is a date, and most often a T or a space and the time of day, down to nine digits after
     the second's point or comma; smaller parts may be left out. The offset is Z, UTC, +02, +0200 or
-    +02:00. A date is 2026-11-24, 2026/11/24 or 24.11.2026. A time of day alone has seconds, and
-    may end in AM or PM.
+    +02:00. A date is 2026-11-24, 2026/11/24, 24.11.2026 or 24-Nov-2026. A time of day alone has
+    seconds, and may end in AM or PM, or begin with a number of days, as durations of pandas do.
     """
     match = _STAMP.fullmatch(field)
     if match is None:
         return "of day" if _OF_DAY.fullmatch(field) else None
-    year, month, day, day_2, month_2, year_2, clock, offset = match.groups()
+    year, month, day, day_2, month_2, year_2, day_3, name, year_3, clock, offset = match.groups()
+    month = month or month_2 or f"{_MONTHS.index(name) + 1:02d}"
     try:
         made = datetime.fromisoformat(
-            f"{year or year_2}-{month or month_2}-{day or day_2} {(clock or '00')[:8]}"
+            f"{year or year_2 or year_3}-{month}-{day or day_2 or day_3} {(clock or '00')[:8]}"
         )
     except ValueError:
         return None
@@ -99,6 +106,10 @@ def stamps_of(texts: Any, form: str) -> Any:
     texts = pc.replace_substring_regex(texts, r"^(\d{4})/(\d\d)/", r"\1-\2-")
     texts = pc.replace_substring_regex(texts, r"^(\d\d)\.(\d\d)\.(\d{4})", r"\3-\2-\1")
     texts = pc.replace_substring_regex(texts, r" ?UTC$", "Z")
+    if pc.any(pc.match_substring_regex(texts, r"^\d\d-[A-Z]")).as_py():
+        for number, month in enumerate(_MONTHS, 1):
+            named = rf"^(\d\d)-{month}-(\d{{4}})"
+            texts = pc.replace_substring_regex(texts, named, rf"\2-{number:02d}-\1")
     return texts.cast(pa.timestamp("ns", "UTC" if form == "with" else None))
 
 
@@ -108,17 +119,20 @@ def _of_day(texts: Any) -> Any:
 
     found = pc.extract_regex(
         texts,
-        r"^(?P<h>\d{1,2}):(?P<m>[0-5]\d):(?P<s>[0-5]\d)(?:[.,](?P<f>\d{1,9}))?"
+        r"^(?:(?P<d>-?\d{1,6}) days?,? \+?)?"
+        r"(?P<h>\d{1,2}):(?P<m>[0-5]\d):(?P<s>[0-5]\d)(?:[.,](?P<f>\d{1,9}))?"
         r"(?: ?(?P<p>[AaPp])\.?[Mm]\.?)?$",
     )
     if found.null_count > texts.null_count:
         raise pa.ArrowInvalid("a text is no time of day")
-    part = {name: pc.struct_field(found, name) for name in "hmsfp"}
+    part = {name: pc.struct_field(found, name) for name in "dhmsfp"}
+    days = pc.if_else(pc.equal(part["d"], ""), "0", part["d"]).cast(pa.int64())
     whole = {name: part[name].cast(pa.int64()) for name in "hms"}
     half = pc.utf8_lower(part["p"])
     twelve = pc.and_(pc.not_equal(half, ""), pc.equal(whole["h"], 12))
     hours = pc.if_else(twelve, 0, whole["h"])
     hours = pc.if_else(pc.equal(half, "p"), pc.add(hours, 12), hours)
+    hours = pc.add(hours, pc.multiply(days, 24))
     minutes = pc.add(pc.multiply(hours, 60), whole["m"])
     seconds = pc.add(pc.multiply(minutes, 60), whole["s"])
     digits = pc.utf8_rpad(part["f"], 9, "0").cast(pa.int64())
