@@ -12,6 +12,7 @@ from offbeat.baselines import (
     AgeBins,
     CausalBaseline,
     DampedSlope,
+    base,
     fill,
     fit_baseline,
     forecast,
@@ -141,6 +142,21 @@ def test_a_causal_baseline_uses_what_was_observed_strictly_before(fitted):
         # Further times that are asked change nothing.
         some = ob.Dataset((t.slice(0, row + 1),))
         assert np.array_equal(fitted.predict(some)[0], plain[: row + 1])
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_rows_that_are_read_together_have_the_bits_of_rows_read_one_by_one(
+    fitted, count, monkeypatch
+):
+    if not fitted.causal:
+        pytest.skip("uses the future")
+    some = tasks(seed=1, count=count)
+    monkeypatch.setattr(base, "READ_AT_ONCE", 1)
+    one_by_one = fitted.predict(some)
+    for most in (7, 20, 1000):
+        monkeypatch.setattr(base, "READ_AT_ONCE", most)
+        for a, b in zip(fitted.predict(some), one_by_one, strict=True):
+            assert np.array_equal(a, b)
 
 
 def test_a_causal_baseline_gives_the_same_on_torch_tensors(fitted):

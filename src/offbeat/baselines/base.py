@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, ClassVar
@@ -21,6 +22,12 @@ State = dict[str, Any]
 
 CHUNK = 256
 """Trajectories that are stepped through together."""
+
+READ_AT_ONCE = 1024
+"""Rows of all these trajectories that are read together, about."""
+
+_batch: ContextVar[int] = ContextVar("batch", default=0)
+"""Trajectories whose rows are read together."""
 
 
 class Baseline(ABC):
@@ -196,13 +203,52 @@ def stepped(machine: Any, rows: Rows) -> Array:
     Returns:
         (batch, rows, ...) what was read.
     """
-    state = machine.start(np.zeros((rows.values.shape[0], rows.values.shape[2])))
+    batch, length, channels = rows.values.shape
+    state = machine.start(np.zeros((batch, channels)))
     reads = []
-    for i in range(rows.values.shape[1]):
-        time = rows.times[:, i, None]
-        reads.append(machine.read(state, time))
-        state = machine.observe(state, time, rows.values[:, i], rows.observed[:, i])
-    return np.stack(reads, axis=1)
+    # A machine reads many rows of a long trajectory at once, as if they were a batch.
+    together = max(READ_AT_ONCE // batch, 1)
+    for first in range(0, length, together):
+        states, some = [], slice(first, first + together)
+        for i in range(first, min(first + together, length)):
+            states.append(state)
+            if rows.observed[:, i].any():
+                time = rows.times[:, i, None]
+                state = machine.observe(state, time, rows.values[:, i], rows.observed[:, i])
+        before = _batch.set(batch)
+        read = machine.read(_concatenated(states), rows.times[:, some].T.reshape(-1, 1))
+        _batch.reset(before)
+        reads.append(np.moveaxis(read.reshape(-1, batch, *read.shape[1:]), 0, 1))
+    return np.concatenate(reads, axis=1)
+
+
+def product(rows: Any, weights: Any) -> Any:
+    """The matrix product of what is read, with weights.
+
+    Its bits do not depend on how many rows are read together: a product of another shape may add in
+    another order.
+
+    Args:
+        rows: (batch, inputs), or several times as many where rows are read together.
+        weights: (inputs, outputs).
+    """
+    batch = _batch.get()
+    if not batch or len(rows) == batch:
+        return rows @ weights
+    each = rows.reshape(-1, batch, rows.shape[1]) @ weights
+    return each.reshape(len(rows), -1)
+
+
+def _concatenated(states: Sequence[State]) -> State:
+    """States of equal form as those of one batch."""
+    if len(states) == 1:
+        return states[0]
+    return {
+        name: _concatenated([state[name] for state in states])
+        if isinstance(value, dict)
+        else np.concatenate([state[name] for state in states])
+        for name, value in states[0].items()
+    }
 
 
 def moments(dataset: Dataset) -> tuple[Array, Array]:

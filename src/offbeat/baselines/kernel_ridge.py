@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import BASELINES, Array, namespace
+from offbeat.baselines.base import BASELINES, Array, namespace, product
 from offbeat.baselines.examples import Examples
 from offbeat.baselines.ridge import Ridge
 from offbeat.baselines.simple import as_kind
@@ -49,7 +49,8 @@ class KernelRidge(Ridge):
         """(batch, shared features) those of all channels, a 1, and those of the kernel."""
         plain = super().shared(features)
         inputs = _inputs(features)
-        kernel = gaussians(inputs, as_kind(self.centres, inputs)) @ as_kind(self.root, inputs)
+        near = gaussians(inputs, as_kind(self.centres, inputs))
+        kernel = product(near, as_kind(self.root, inputs))
         return namespace(plain).concatenate([plain, kernel], -1)
 
     def _solve(self, found: Examples, features: Array, alike: Array) -> None:
@@ -82,7 +83,7 @@ def gaussians(inputs: Any, centres: Any) -> Any:
         (batch, centres).
     """
     xp = namespace(inputs)
-    square = (inputs**2).sum(-1)[:, None] + (centres**2).sum(-1) - 2 * inputs @ centres.T
+    square = (inputs**2).sum(-1)[:, None] + (centres**2).sum(-1) - product(2 * inputs, centres.T)
     square = xp.clip(square, 0.0, np.inf) / centres.shape[1]
     return sum(xp.exp(square / (-2 * width**2)) for width in WIDTHS) / len(WIDTHS)
 

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import BASELINES, Array, CausalBaseline, Rows, State, namespace, padded
+from offbeat.baselines.base import (
+    BASELINES,
+    Array,
+    CausalBaseline,
+    Rows,
+    State,
+    namespace,
+    padded,
+    product,
+)
 from offbeat.baselines.examples import some_tasks
 from offbeat.baselines.folds import folds_of
 from offbeat.baselines.history import AgeBins, History, typical_gap
@@ -92,8 +101,9 @@ class ResidualGru(CausalBaseline):
         age = History.age(state, time)
         since, unit = self.elapsed(age)
         joined = xp.concatenate([state["hidden"], since], -1)
-        layer = xp.tanh(joined @ as_kind(self.read_weight, like) + as_kind(self.read_bias, like))
-        out = layer @ as_kind(self.out_weight, like) + as_kind(self.out_bias, like)
+        read = product(joined, as_kind(self.read_weight, like))
+        layer = xp.tanh(read + as_kind(self.read_bias, like))
+        out = product(layer, as_kind(self.out_weight, like)) + as_kind(self.out_bias, like)
         change = xp.clip(out, -FURTHEST, FURTHEST) * unit * as_kind(self.scale, like)
         predicted = History.last(state, as_kind(self.mean, like)) + change
         return xp.clip(predicted, as_kind(self.bound[0], like), as_kind(self.bound[1], like))

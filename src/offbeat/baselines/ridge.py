@@ -13,6 +13,7 @@ from offbeat.baselines.base import (
     CausalBaseline,
     State,
     namespace,
+    product,
 )
 from offbeat.baselines.examples import FURTHEST, Examples, examples_of, likeness, some_tasks
 from offbeat.baselines.held_out import held_out_ridge
@@ -149,7 +150,7 @@ class Ridge(CausalBaseline):
         change = (own * as_kind(self.own_weight, like)[at, channel]).sum(-1)
         bins, inputs, channels = self.weight.shape
         weight = as_kind(self.weight.transpose(1, 0, 2).reshape(inputs, -1), like)
-        each = (self.shared(features) @ weight).reshape(-1, bins, channels)
+        each = product(self.shared(features), weight).reshape(-1, bins, channels)
         for i in range(bins):
             change = change + xp.where(at == i, relative * each[:, i], 0.0)
         # Beyond what was fitted to, a change is no larger than those that were seen.
