@@ -1,11 +1,14 @@
 """Writes the trained models that come with the package, with their cards.
 
+    python examples/ship_models.py --experiment_1
+    python examples/ship_models.py --experiment_2 runs/thesis
     python examples/ship_models.py --large runs/hopper/large_fresh_long-seed0
-    python examples/ship_models.py --walker runs/walker --lasa runs/lasa
+    python examples/ship_models.py --robot walker runs/walker --lasa runs/lasa
 
-takes those of the thesis' protocol from results/thesis: experiment 1, first repeat, 300 epochs; the
-large model from the run of `examples.hopper`; and others from the runs of the commands in
-`WALKER` and `LASA`.
+The first takes ODE-RNN and ODE-GRU-D of the thesis' experiment 1 from results/thesis (first repeat,
+300 epochs), the second those models of its experiment 2 (first repeat) that a folder of
+`python -m thesis run` has, with the scores of the record. The large model is a run of
+`examples.hopper`; others are runs of the commands of `robot_commands` and `LASA`.
 """
 
 from __future__ import annotations
@@ -23,7 +26,12 @@ from offbeat.models.hub import CARD, card_of
 ROOT = Path(__file__).parents[1]
 RECORD, SHIPPED = ROOT / "results/thesis", ROOT / "src/offbeat/trained"
 FRACTIONS = (90, 30)
-THESIS = {"ode_rnn": "ODE-RNN", "ode_gru_d": "ODE-GRU-D"}
+EXPERIMENT_1 = {"ode_rnn": "ODE-RNN of the thesis", "ode_gru_d": "ODE-GRU-D of the thesis"}
+EXPERIMENT_2 = {
+    "gru": "GRU of the thesis, fed with its own predictions",
+    "gru_d": "GRU-D of the thesis, fed with its own predictions",
+    "anchored_ode_gru_d": "anchored ODE-GRU-D, small",
+}
 
 
 def ship(folder: Path, name: str, about: str, sections: dict[str, str]) -> None:
@@ -36,13 +44,21 @@ def ship(folder: Path, name: str, about: str, sections: dict[str, str]) -> None:
     print(target.relative_to(ROOT))
 
 
-def thesis_models() -> None:
-    """ODE-RNN and ODE-GRU-D on the hopper, with 90 and 30 % of the rows observed."""
+def thesis_models(experiment: int, models: dict[str, str], folder: Path) -> None:
+    """Models on the hopper's next row, with 90 and 30 % of the rows observed.
+
+    Args:
+        experiment: of the thesis.
+        models: titles by the names of the record.
+        folder: of the checkpoints, one per run.
+    """
     with open(RECORD / "record.csv", newline="", encoding="utf-8") as file:
         record = {row["run_id"]: row for row in csv.DictReader(file)}
-    for name, title in THESIS.items():
+    for name, title in models.items():
         for percent in FRACTIONS:
-            run = f"e1-{name}-{percent}-r00"
+            run = f"e{experiment}-{name}-{percent}-r00"
+            if not (folder / run).exists():
+                continue
             row = record[run]
             error, held = (
                 math.sqrt(float(row[key])) for key in ("honest_mse", "last_value_honest_mse")
@@ -52,21 +68,43 @@ def thesis_models() -> None:
                 f"window of 100 rows of each, of which {percent} % are observed; scaled as in "
                 "the thesis. 7,000 train, 1,500 validate, 1,500 test.",
                 "Made by": "`python -m thesis run --out runs/thesis --only "
-                f"experiment=1,repeat=0,model={name},fraction={percent / 100:g}`: "
+                f"experiment={experiment},repeat=0,model={name},fraction={percent / 100:g}`: "
                 f"{row['epochs']} epochs, {float(row['seconds']) / 60:.0f} min on one core of an "
                 f"{row['cpu']} ({row['kernel_body']}), commit {row['commit']}. It is the model of "
-                f"`results/thesis/models/{run}`.",
+                f"the run `{run}` of `results/thesis/record.csv`.",
                 "Scores": "Test RMSE after the first observation of each channel, in the thesis' "
-                f"units: {error:.4f}; of the last value {held:.4f} (`results/thesis/record.csv`). "
-                "It decodes each row from the state after the row before, as the thesis does "
-                '(`readout="last_row"`), so it predicts the next row of a grid, not any time.',
+                f"units: {error:.4f}; of the last value {held:.4f} (`results/thesis/record.csv`)."
+                + (" **It loses to the last value.**" if error > held else "")
+                + (" " + NEXT_ROW if name in ("gru", "gru_d", *EXPERIMENT_1) else ""),
                 "Licence": "Apache-2.0, as Offbeat.",
             }
             about = (
-                f"{title} of the thesis: the hopper's next row, {percent} % of the rows observed; "
+                f"{title}: the hopper's next row, {percent} % of the rows observed; "
                 f"test RMSE {error:.4f} (last value {held:.4f})"
             )
-            ship(RECORD / "models" / run, f"hopper-{percent}-{name}", about, sections)
+            ship(folder / run, f"hopper-{percent}-{name}", about, sections)
+
+
+def check_scores(out: Path) -> None:
+    """Stops where a run of a folder has another score than the run of the record.
+
+    Args:
+        out: of `python -m thesis run`.
+    """
+    scores = []
+    for path in (RECORD / "record.csv", out / "record.csv"):
+        with open(path, newline="", encoding="utf-8") as file:
+            scores.append({row["run_id"]: row["honest_mse"] for row in csv.DictReader(file)})
+    record, made = scores
+    other = [run for run, score in made.items() if float(score) != float(record[run])]
+    if other:
+        raise SystemExit(f"other scores than in {RECORD}: {', '.join(other)}")
+
+
+NEXT_ROW = (
+    "It decodes each row from the state after the row before, as the thesis does "
+    '(`readout="last_row"`), so it predicts the next row of a grid, not any time.'
+)
 
 
 def large_model(run: Path) -> None:
@@ -93,11 +131,19 @@ def large_model(run: Path) -> None:
     ship(run / "model", "hopper-anchored-large", about, sections)
 
 
-WALKER = (
-    "offbeat simulate walker.parquet --robot walker --n_trajectories 3000",
-    "offbeat train walker.parquet runs/walker --model.name anchored_ode_gru_d --split.window 100 "
-    "--split.observed_fraction 0.3 --two_sided false --training.epochs 30",
-)
+ROBOTS = {"walker": "2.5 ms", "cheetah": "10 ms", "humanoid": "5 ms"}
+"""Time between two rows of each robot."""
+
+
+def robot_commands(robot: str) -> tuple[str, ...]:
+    """The commands that made the model of a robot."""
+    return (
+        f"offbeat simulate {robot}.parquet --robot {robot} --n_trajectories 3000",
+        f"offbeat train {robot}.parquet runs/{robot} --model.name anchored_ode_gru_d "
+        "--split.window 100 --split.observed_fraction 0.3 --two_sided false --training.epochs 30",
+    )
+
+
 LASA = (
     "python examples/lasa.py lasa.parquet",
     "offbeat train --config examples/lasa.yaml lasa.parquet runs/lasa",
@@ -127,22 +173,35 @@ def other_model(run: Path, name: str, title: str, data: str, commands: tuple[str
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Writes the models that come with the package.")
+    parser.add_argument("--experiment_1", action="store_true", help="from results/thesis")
+    parser.add_argument("--experiment_2", type=Path, help="folder of `python -m thesis run`")
     parser.add_argument("--large", type=Path, help="run of examples.hopper with the large model")
-    parser.add_argument("--walker", type=Path, help="run of the last command in WALKER")
+    parser.add_argument(
+        "--robot",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("ROBOT", "RUN"),
+        help=f"of {', '.join(ROBOTS)}, and the run of its commands",
+    )
     parser.add_argument("--lasa", type=Path, help="run of the last command in LASA")
     given = parser.parse_args()
-    if not (given.walker or given.lasa):
-        thesis_models()
+    if given.experiment_1:
+        thesis_models(1, EXPERIMENT_1, RECORD / "models")
+    if given.experiment_2:
+        check_scores(given.experiment_2)
+        thesis_models(2, EXPERIMENT_2, given.experiment_2 / "models")
     if given.large:
         large_model(given.large)
-    if given.walker:
+    for robot, run in given.robot:
         other_model(
-            given.walker,
-            "walker-30-anchored",
-            "anchored ODE-GRU-D: the walker at any time, 30 % of the rows observed",
-            "MuJoCo's walker, falling: 3,000 trajectories of 200 rows at 2.5 ms; a window of 100 "
-            "rows of each, of which 30 % are observed. 2,100 train, 450 validate, 450 test.",
-            WALKER,
+            Path(run),
+            f"{robot}-30-anchored",
+            f"anchored ODE-GRU-D: the {robot} at any time, 30 % of the rows observed",
+            f"MuJoCo's {robot}, falling: 3,000 trajectories of 200 rows at {ROBOTS[robot]}; a "
+            "window of 100 rows of each, of which 30 % are observed. 2,100 train, 450 validate, "
+            "450 test.",
+            robot_commands(robot),
         )
     if given.lasa:
         other_model(
