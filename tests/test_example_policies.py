@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import offbeat as ob
+from examples import irregular_walker
 from examples.policies.measures import distances, swept_error_area
 from examples.policies.shapes import RETURNS_S, cloned, pushed
 
@@ -52,6 +53,47 @@ def test_a_part_of_the_stamps_is_as_many_as_asked_with_both_ends():
     assert len(some.times) == 60
     assert (some.times[0], some.times[-1]) == (0.0, 1.0)
     assert some.roles == ("state", "state", "action", "action")
+
+
+def test_windows_of_the_walker_end_with_the_frame_that_is_asked_for():
+    times = 0.008 * np.arange(400)
+    values = np.stack([times, times**2], axis=1)
+    cut = irregular_walker.windows(ob.Trajectory(times, values), _random(), 16)
+    assert len(cut) == pytest.approx((0.9 * 400 - 64) / 16, abs=2)
+    for window in cut:
+        left = window.observed.any(axis=1)
+        assert left.sum() == 64
+        assert left[0]
+        assert not left[-1]
+    gone = 1 - np.concatenate([w.observed[:-1, 0] for w in cut]).mean()
+    assert gone == pytest.approx(0.1, abs=0.03)
+    held = [np.concatenate([w.values[:1], w.values[:-1]]) for w in cut]
+    slopes = np.array([0.008**2, np.mean([np.mean(_steps(w)) for w in cut])])
+    error = irregular_walker.mean_squared_error(held, ob.Dataset(tuple(cut)))
+    assert error == pytest.approx(slopes.mean())
+
+
+def _steps(window: ob.Trajectory) -> np.ndarray:
+    rows = np.flatnonzero(window.observed[:, 0])
+    return (window.values[rows + 1, 1] - window.values[rows, 1]) ** 2
+
+
+@pytest.mark.parametrize("kind", ["cfc", "cfc_mixed", "ltc"])
+def test_networks_of_ncps_predict_a_window_alike_alone_and_among_others(kind):
+    pytest.importorskip("ncps")
+    random = _random()
+    made = []
+    for i in range(3):
+        times = np.cumsum(random.uniform(0.5, 2.0, 200 + i))
+        made += irregular_walker.windows(ob.Trajectory(times, np.sin(times)[:, None]), random, 60)
+    model = ob.make_model("ncps", ob.Dataset(tuple(made)), kind=kind, units=8)
+    together = irregular_walker.predicted(model, ob.Dataset(tuple(made)))
+    for i, window in enumerate(made):
+        alone = irregular_walker.predicted(model, ob.Dataset((window,)))[0]
+        assert np.allclose(together[i], alone, atol=1e-5)  # float32, as ncps has it
+    slower = ob.Trajectory(2 * made[0].times, made[0].values, made[0].observed)
+    changed = irregular_walker.predicted(model, ob.Dataset((slower,)))[0]
+    assert np.abs(changed - together[0])[2:].max() > 1e-3  # times do matter
 
 
 def _random() -> np.random.Generator:
