@@ -72,13 +72,64 @@ def table(folder: Path, training: str) -> str:
 def _line(name: str, returns: dict[str, Any], zero: float, one: float) -> str:
     entries = []
     for each in returns.values():
-        mean, low, high = interquartile(100 * (each - zero) / (one - zero))
+        mean, low, high = interquartile(_percent(each, zero, one))
         entries.append(f"{mean:.0f}" if len(each) == 1 else f"{mean:.0f} ({low:.0f}–{high:.0f})")
     return f"| {name} | " + " | ".join(entries)
 
 
+def draw(folder: Path, path: Path) -> None:
+    """Returns against the fraction of lost frames, a panel per training, means and intervals.
+
+    Args:
+        folder: of the results.
+        path: of the figure.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    expert, random = (_read(folder / f"{name}.json")["returns"] for name in ("expert", "random"))
+    fractions = [name for name in expert if name.endswith("%")]
+    lost = [float(name.split()[0]) for name in fractions]
+    zero, one = np.mean(random[fractions[0]]), np.mean(expert[fractions[0]])
+    records = [_read(each) for each in sorted(folder.glob("*-*.json"))]
+    trainings = [t for t in TITLES if any(r["training"] == t for r in records)]
+    size = (4.4 * len(trainings) + 2.2, 3.8)
+    figure, axes = plt.subplots(1, len(trainings), figsize=size, sharey=True, squeeze=False)
+    for axis, training in zip(axes[0], trainings, strict=True):
+        held = [interquartile(_percent([expert[name]], zero, one))[0] for name in fractions]
+        axis.plot(lost, held, color="black", ls="--", label="expert, last value")
+        for i, rival in enumerate(RIVALS):
+            some = [r for r in records if (r["rival"], r["training"]) == (rival, training)]
+            if not some:
+                continue
+            each = [
+                interquartile(_percent([r["returns"][name] for r in some], zero, one))
+                for name in fractions
+            ]
+            mean, low, high = np.array(each).T
+            axis.plot(lost, mean, color=f"C{i}", marker="o", ms=3, label=rival)
+            axis.fill_between(lost, low, high, color=f"C{i}", alpha=0.12, lw=0)
+        axis.set_title(TITLES[training], fontsize=10)
+        axis.set_xlabel("frames lost, %")
+        axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("return, % of the expert")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="center right", fontsize=8, frameon=False)
+    figure.tight_layout(rect=(0, 0, 1 - 2.2 / size[0], 1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _percent(returns: Any, zero: float, one: float) -> NDArray[np.float64]:
+    """100 for the expert that sees everything, 0 for random actions."""
+    return 100 * (np.asarray(returns) - zero) / (one - zero)
+
+
 def write(document: Path, folder: Path, robot: str) -> None:
-    """Replaces the tables of a robot in a document, between its marks.
+    """Replaces the tables of a robot in a document, between its marks, and draws its figure.
 
     Args:
         document: with `<!-- ROBOT -->` and `<!-- end of ROBOT -->`.
@@ -91,6 +142,7 @@ def write(document: Path, folder: Path, robot: str) -> None:
     before, rest = text.split(f"<!-- {robot} -->")
     _, after = rest.split(f"<!-- end of {robot} -->")
     inside = "\n\n".join(tables)
+    draw(folder, document.parent / "figures" / f"policies_{robot}.png")
     document.write_text(
         f"{before}<!-- {robot} -->\n\n{inside}\n\n<!-- end of {robot} -->{after}", encoding="utf-8"
     )
