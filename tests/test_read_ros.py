@@ -445,9 +445,10 @@ def fill(fields, name, store, rng, path="", *, numbers):
         made = []
         for k in range(count):
             if kind == "inner":
-                # A list of messages is left out, its numbers are no channels.
-                kept = numbers if not size else []
-                made.append(fill(inner, f"{name}x{i}", store, rng, f"{here}.", numbers=kept))
+                # A list of messages of any length is left out, its numbers are no channels.
+                kept = numbers if size != "[]" else []
+                at = f"{here}[{k}]." if size else f"{here}."
+                made.append(fill(inner, f"{name}x{i}", store, rng, at, numbers=kept))
             elif kind == "string":
                 made.append("x" * int(rng.integers(0, 6)))
             else:

@@ -187,7 +187,8 @@ def find_layout(
         definitions: fields of this type and of its nested types.
         cdr: serialised by ROS 2; else by ROS 1.
         wanted: whether a channel of this name is selected. By default all numbers are, except
-            covariances, sequences longer than `WIDEST`, times, and what the header holds.
+            covariances, sequences longer than `WIDEST`, lists of messages that are longer or whose
+            type does not fix their length, times, and what the header holds.
 
     Raises:
         FileFormatError: the message does not fit the definition, or a type is not known.
@@ -288,7 +289,7 @@ class _Parser:
                 if node != _ARRAY:
                     count = self._length()
                 if inner == _NAME:
-                    self._messages(detail, here, count, row)
+                    self._messages(detail, here, count, row, fixed=node == _ARRAY)
                 elif detail[0] not in _CODES:
                     texts = [self._string(detail[0], keep=name in _NAMES) for _ in range(count)]
                     if name in _NAMES:
@@ -307,18 +308,21 @@ class _Parser:
                 Column(c.name, c.offset, c.code, "", "quaternion") for c in row.columns[first:]
             ]
 
-    def _messages(self, kind: str, here: str, count: int, row: Row) -> None:
+    def _messages(self, kind: str, here: str, count: int, row: Row, *, fixed: bool) -> None:
         """Parses a list of messages: separate rows if they are transforms.
 
-        Others are left out by default; those that are selected have channels `here[0].x`, or
-        `here.hip.x` where all messages of the list have a name, as their order may change.
+        Others have channels `here[0].x`, or `here.hip.x` where all messages of the list have a
+        name, as their order may change. A list whose type does not fix its length is left out by
+        default, as is one longer than `WIDEST`.
         """
-        if kind != _TRANSFORM and self.wanted is not None and count <= _MOST_MESSAGES:
+        most = WIDEST * fixed if self.wanted is None else _MOST_MESSAGES
+        if kind != _TRANSFORM and count <= most:
             first = len(row.columns)
             for i in range(count):
                 self.message(kind, f"{here}[{i}]", row, "")
             labels = {self.labels.get(f"{here}[{i}]", ""): f"{here}[{i}]." for i in range(count)}
-            if len(labels) == count and all(labels) and self.wanted(here):
+            chosen = self.wanted is None or self.wanted(here)
+            if len(labels) == count and all(labels) and chosen:
                 for label, start in labels.items():
                     row.columns[first:] = [
                         replace(c, name=f"{here}.{label}.{c.name[len(start) :]}")
