@@ -190,6 +190,35 @@ def test_times_of_numpy_may_be_a_column(tmp_path):
     assert dataset[0].values.tolist() == matrix.tolist()
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("time,x\n" + f"0,{'1' * 30_000}x\n" * 400, "no column of numbers"),
+        ("time,x\n" + f"{'1' * 30_000}:0,1\n" * 400, "in line 2, column 'time'"),
+        ("time," + ",".join(["x"] * 60_000) + "\n" + "0" + ",1" * 60_000 + "\n", "'x' twice"),
+        (
+            "time," + ",".join(map(str, range(60_000))) + "\n0" + ",1" * 60_000 + "\n",
+            "60001 columns",
+        ),
+        ("time,x\n0,1\n" + "\n" * 3_000_000 + "1,2\n", "empty lines in a row"),
+    ],
+    ids=["digits", "digits of a time", "equal names", "columns", "empty lines"],
+)
+def test_a_hostile_table_is_refused_in_linear_time(content, message, tmp_path):
+    (tmp_path / "log.csv").write_text(content)
+    with pytest.raises(FileFormatError, match=message), fuzz.time_limit():
+        read(tmp_path / "log.csv")
+
+
+def test_a_long_line_of_poses_is_refused_before_it_is_taken_apart(tmp_path):
+    (tmp_path / "log.tum").write_text("1 2 3 4 5 6 7 8 " * 100_000)
+    with pytest.raises(FileFormatError, match=r"in line 1, expected eight numbers"):
+        read(tmp_path / "log.tum")
+    (tmp_path / "log.tum").write_text("#" * 20_000 + "\n0 1 2 3 0 0 0 1\n")
+    with pytest.raises(FileFormatError, match="a line of more than 10000 characters"):
+        read(tmp_path / "log.tum")
+
+
 @pytest.mark.parametrize("empty", [3, 1200])
 def test_booleans_are_numbers_wherever_they_begin(empty, tmp_path):
     rows = [f"{i},{'' if i < empty else ('True', 'False')[i % 2]}" for i in range(empty + 50)]

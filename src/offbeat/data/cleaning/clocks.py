@@ -6,6 +6,7 @@ stamps are integers until the start is subtracted, and are converted to seconds 
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -105,6 +106,7 @@ def is_unit(text: str) -> bool:
     return len(parts) > 1 and bool(known) and all(part in _UNIT_WORDS for part in known)
 
 
+@functools.lru_cache(maxsize=1 << 14)
 def folded(name: str) -> str:
     """A column's name without its unit, as it is compared: `%TimeUS`, `time.us` are `time_us`."""
     stem = split_unit(name)[0].lstrip("#%_ \t")

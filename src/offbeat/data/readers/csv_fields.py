@@ -23,7 +23,7 @@ SWITCHES = {"yes": 1, "no": 0, "on": 1, "off": 0}
 """Words for 1 and 0, in any case, in a column that holds no others."""
 
 _HEX = re.compile(r"0[xX][0-9a-fA-F]{1,13}")
-_FORTRAN = r"^([+-]?[0-9]*\.?[0-9]+|[+-]?[0-9]+\.)[dD]([+-]?[0-9]+)$"
+_FORTRAN = r"^([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))[dD]([+-]?[0-9]+)$"
 
 _NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$|^[+-]?(inf|infinity|nan)$"
 _INFINITE = r"^([+-]?)1\.#(INF|inf).*$"

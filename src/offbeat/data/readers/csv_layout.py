@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -165,8 +166,9 @@ def _grouped(rows: list[Row], head: int, names: tuple[str, ...]) -> tuple[str, .
     of a `MultiIndex`. A group holds up to the next one; a line that is equal in all columns, or
     holds numbers, tells nothing apart.
     """
-    twice = {name for name in names if names.count(name) > 1 or not name}
-    if not twice or (names[-1:] == ("",) and names.count("") == 1 and len(twice) == 1):
+    counts = Counter(names)
+    twice = {name for name, count in counts.items() if count > 1 or not name}
+    if not twice or (names[-1:] == ("",) and counts[""] == 1 and len(twice) == 1):
         return names
     above: list[list[str]] = []
     below = rows[head][0]

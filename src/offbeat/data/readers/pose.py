@@ -51,6 +51,7 @@ _QUATERNION = {word for word, name in _POSE.items() if name.startswith("q")}
 
 _FIRST_NS, _LAST_NS = 946_684_800 * 10**9, 4_102_444_800 * 10**9  # 2000 and 2100
 _LINES = 200  # lines from which the meaning of the numbers is derived
+_LONGEST = 10_000  # characters of a line of eight numbers
 _OFF_1 = 0.05  # from the length of a quaternion
 _COPIES = 3  # copies of a text in memory while it is read
 
@@ -87,6 +88,9 @@ def read_tum(path: str | Path, *, time_unit: str | None = None) -> list[Recordin
     require_memory(path, _COPIES * size, f"{size} bytes of text")
     text = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
     text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if re.search(rb"[^\n]{%d}" % _LONGEST, text):
+        _explain(path)
+        raise FileFormatError(f"{path} has a line of more than {_LONGEST} characters")
     text = re.sub(rb"(?m)^[ \t]*(?:#.*)?\n?", b"", text)
     text = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)[ \t]+$", b"", text))
     if not text:

@@ -121,12 +121,12 @@ def read_csv(
         sample = CsvSample(sample.fields, file)
         notes += more
     named = [name for name in header if name]
-    columns = Columns.of(text.path, named, options, sample)
-    if len(columns.channels) > MOST_CHANNELS:
+    if channels is None and len(named) > MOST_CHANNELS:
         raise FileFormatError(
-            f"{text.path} has {len(columns.channels)} columns of channels, more than "
-            f"{MOST_CHANNELS}; choose some with channels="
+            f"{text.path} has {len(named)} columns, more than {MOST_CHANNELS}; choose some with "
+            "channels="
         )
+    columns = Columns.of(text.path, named, options, sample)
     if columns.rest or not columns.time or sample.form_of(columns.time):
         unit, found = "ns", False
     else:

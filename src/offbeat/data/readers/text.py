@@ -23,6 +23,7 @@ LONGEST_LINE = 1 << 24
 COMPRESSED = (".gz", ".bz2", ".xz")
 """Suffixes after that of a text file which is compressed; the content alone decides."""
 
+_MOST_EMPTY = 100_000
 _BLOCK = 1 << 20
 _START = 1 << 16  # bytes from which the encoding is derived
 _OPENERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open}
@@ -114,7 +115,14 @@ class TextFile:
             with io.TextIOWrapper(
                 binary, encoding=self.encoding, errors=self._errors, newline=""
             ) as file:
+                empty = 0
                 while line := file.readline(LONGEST_LINE):
+                    empty = empty + 1 if len(line) <= 2 and not line.strip() else 0
+                    if empty > _MOST_EMPTY:
+                        raise FileFormatError(
+                            f"{self.path} has more than {_MOST_EMPTY} empty lines in a row, "
+                            "expected a table with a row per line; write it again"
+                        )
                     if len(line) == LONGEST_LINE:
                         raise FileFormatError(
                             f"{self.path} has a line of more than {LONGEST_LINE} characters, "
