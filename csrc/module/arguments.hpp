@@ -1,11 +1,5 @@
-// Checks of the arguments from Python: arrays, sizes, specs. Part of module.cpp.
-
-template <class T>
-using Array = nb::ndarray<T, nb::device::cpu>;
-template <class T>
-using Const = nb::ndarray<const T, nb::device::cpu>;
-template <class T>
-using Maybe = std::optional<Const<T>>;
+// Checks of arguments: arrays, sizes, specs. Part of module.cpp and library/stream.cpp, which say
+// what Array, Const and Maybe are.
 
 // Becomes offbeat.errors.InputError in Python.
 struct InputError : std::runtime_error {

@@ -1,4 +1,5 @@
-// The instruction sets that this processor can run: part of module.cpp.
+// The instruction sets that this processor can run: part of module.cpp and
+// library/stream.cpp.
 
 std::vector<const InstructionSet*> runnable() {
   std::vector<const InstructionSet*> found;

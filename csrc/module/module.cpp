@@ -40,6 +40,13 @@ extern const InstructionSet kernels_avx512;
 
 namespace {
 
+template <class T>
+using Array = nb::ndarray<T, nb::device::cpu>;
+template <class T>
+using Const = nb::ndarray<const T, nb::device::cpu>;
+template <class T>
+using Maybe = std::optional<Const<T>>;
+
 #include "arguments.hpp"
 #include "instruction_sets.hpp"
 #include "threads.hpp"
@@ -47,7 +54,9 @@ namespace {
 #include "batch.hpp"
 #include "perceptron.hpp"
 #include "gains.hpp"
+#include "batch_gains.hpp"
 #include "stream.hpp"
+#include "bind_stream.hpp"
 #include "in_order.hpp"
 
 template <class T>

@@ -1,4 +1,5 @@
-// The memory of a call, and its work spread over threads: part of module.cpp.
+// The memory of a call, and its work spread over threads: part of module.cpp and
+// library/stream.cpp.
 
 // Bytes of memory that this machine has. No buffer may be larger.
 int64_t memory_limit() {

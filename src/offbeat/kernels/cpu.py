@@ -175,30 +175,37 @@ def scan(
 @lru_cache(maxsize=64)
 def compiled_spec(spec: ScanSpec) -> Any:
     """The compiled module's form of a spec."""
+    arguments = spec_arguments(spec)
+    if not spec.trend:  # a module of 0.2 does not know it
+        del arguments["trend"]
+    return compiled.Spec(**arguments)
+
+
+def spec_arguments(spec: ScanSpec) -> dict[str, Any]:
+    """The arguments of the compiled module's form of a spec: numbers and lists of them."""
     scheme = tableau(spec.solver)
-    further = {"trend": True} if spec.trend else {}  # a module of 0.2 does not know it
-    return compiled.Spec(
-        channels=spec.channels,
-        hidden=spec.hidden_size,
-        anchored=spec.channels if spec.anchored else 0,
-        time_inputs=spec.time_inputs,
-        cell=_CELLS[spec.cell],
-        reset_after=spec.reset_after,
-        field=list(spec.field),
-        activation=_ACTIVATIONS[spec.activation],
-        a=[list(row) for row in scheme.a],
-        b=list(scheme.b),
-        steps=spec.steps_per_gap,
-        max_step=spec.max_step or 0.0,
-        nodes=spec.nodes,
-        decay_span=spec.decay_span,
-        bounded=spec.bounded,
-        decay_features=spec.decay,
-        decay_rows=_DECAY_ROWS[spec.decay_rows],
-        input_decay=spec.input_decay,
-        decoder=list(spec.decoder),
-        **further,
-    )
+    return {
+        "channels": spec.channels,
+        "hidden": spec.hidden_size,
+        "anchored": spec.channels if spec.anchored else 0,
+        "time_inputs": spec.time_inputs,
+        "cell": _CELLS[spec.cell],
+        "reset_after": spec.reset_after,
+        "field": list(spec.field),
+        "activation": _ACTIVATIONS[spec.activation],
+        "a": [list(row) for row in scheme.a],
+        "b": list(scheme.b),
+        "steps": spec.steps_per_gap,
+        "max_step": spec.max_step or 0.0,
+        "nodes": spec.nodes,
+        "decay_span": spec.decay_span,
+        "bounded": spec.bounded,
+        "decay_features": spec.decay,
+        "decay_rows": _DECAY_ROWS[spec.decay_rows],
+        "input_decay": spec.input_decay,
+        "decoder": list(spec.decoder),
+        "trend": spec.trend,
+    }
 
 
 def _array(tensor: Tensor | None) -> Any:

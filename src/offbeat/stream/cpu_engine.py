@@ -28,45 +28,10 @@ class CpuEngine(Engine):
 
     def __init__(self, model: Model, *, seed: int = 0) -> None:
         self._model, self._seed = model, seed
-        config, spec = model.config, model.spec
         self._dtype = np.dtype(str(model.dtype).removeprefix("torch."))
-        self._fraction = float(config.self_feeding or 0.0)
-        limit, statistics = float(config.gap_limit or 1), model.statistics
-        decoder, decoder_weights = [], None
-        if layers := model.head.layers:
-            decoder = [layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers)]
-            decoder_weights = _flat([t for layer in layers for t in layer])
-        further = {}
-        if spec.trend:
-            filters = model.filters
-            further = {
-                "filters": filters.table.cpu().numpy(),
-                "prior": filters.prior().cpu().numpy(),
-            }
-        with torch.no_grad():
-            self._live = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")(
-                spec=cpu.compiled_spec(spec),
-                instruction_set=choose(spec, model.dtype, model.device).variant,
-                weights=_flat(list(model.scan_parts().tensors())),
-                mean=model.mean.numpy(),
-                std=model.std.numpy(),
-                decoder=decoder,
-                decoder_weights=decoder_weights,
-                first_state=model.first_state(1)[0].detach().contiguous().numpy(),
-                low=model.low.numpy() if spec.bounded else None,
-                high=model.high.numpy() if spec.bounded else None,
-                unit=model.time_unit,
-                time_input_unit=model.time_input_unit,
-                elapsed_limit=model.elapsed_limit,
-                longest_delta=statistics.longest_delta * limit,
-                time_input=_TIME_INPUTS[config.time_input or "none"],
-                from_first_row=config.clock == "first_row",
-                last_row=config.readout == "last_row",
-                every_row=config.update_rows == "every",
-                starts_only=config.cell == "none",
-                exponential=bool(spec.decay) and not isinstance(model.decay, TrainableDecay),
-                **further,
-            )
+        self._fraction = float(model.config.self_feeding or 0.0)
+        kind = getattr(cpu.compiled, f"StreamEngine_{cpu.suffix(model.dtype)}")
+        self._live = kind(**engine_arguments(model))
         self._generator: torch.Generator | None = None
         self._kept: list[torch.Tensor | None] = []
         self.reset()
@@ -173,6 +138,51 @@ class CpuEngine(Engine):
             *trend,
             ("rows", (), np.int64),
         ]
+
+
+def engine_arguments(model: Model) -> dict[str, Any]:
+    """What the compiled engine is made of: a spec, arrays and numbers.
+
+    Args:
+        model: that the engine supports.
+    """
+    config, spec = model.config, model.spec
+    limit = float(config.gap_limit or 1)
+    decoder, decoder_weights = [], None
+    if layers := model.head.layers:
+        decoder = [layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers)]
+        decoder_weights = _flat([t for layer in layers for t in layer])
+    further = {}
+    if spec.trend:
+        filters = model.filters
+        further = {
+            "filters": filters.table.cpu().numpy(),
+            "prior": filters.prior().cpu().numpy(),
+        }
+    with torch.no_grad():
+        return dict(
+            spec=cpu.compiled_spec(spec),
+            instruction_set=choose(spec, model.dtype, model.device).variant,
+            weights=_flat(list(model.scan_parts().tensors())),
+            mean=model.mean.numpy(),
+            std=model.std.numpy(),
+            decoder=decoder,
+            decoder_weights=decoder_weights,
+            first_state=model.first_state(1)[0].detach().contiguous().numpy(),
+            low=model.low.numpy() if spec.bounded else None,
+            high=model.high.numpy() if spec.bounded else None,
+            unit=model.time_unit,
+            time_input_unit=model.time_input_unit,
+            elapsed_limit=model.elapsed_limit,
+            longest_delta=model.statistics.longest_delta * limit,
+            time_input=_TIME_INPUTS[config.time_input or "none"],
+            from_first_row=config.clock == "first_row",
+            last_row=config.readout == "last_row",
+            every_row=config.update_rows == "every",
+            starts_only=config.cell == "none",
+            exponential=bool(spec.decay) and not isinstance(model.decay, TrainableDecay),
+            **further,
+        )
 
 
 def _flat(tensors: list[torch.Tensor]) -> NDArray[Any]:
