@@ -30,7 +30,7 @@ import offbeat as ob
 from offbeat import kernels
 from offbeat.captured import captured
 from offbeat.models.zoo import recipe_of
-from offbeat.run import RunState, flat_parameters
+from offbeat.run import FlatParameters, RunState
 from offbeat.sweeps.stacked import StackedModels
 from offbeat.training import Examples, train_step
 
@@ -64,7 +64,7 @@ class Run:
         batch = self.model.batch(data).to(device)
         self.examples = Examples(self.model, batch)
         self.recipe = recipe_of(self.model.name, ob.TrainConfig(), validated=False)
-        self.state = RunState(flat_parameters(self.model).__enter__(), self.recipe)
+        self.state = RunState(FlatParameters(self.model), self.recipe)
         self.index = torch.arange(len(self.examples), device=device)
 
     def step(self, backend: str) -> Step:

@@ -21,7 +21,7 @@ from common import synthetic
 import offbeat as ob
 from offbeat.examples import AHEAD, TrainingSet, order_of
 from offbeat.models.zoo import recipe_of
-from offbeat.run import RunState, flat_parameters
+from offbeat.run import FlatParameters, RunState
 from offbeat.training import train_step
 
 MODEL = "anchored_ode_gru_d"
@@ -54,7 +54,7 @@ def cost(size: str, batch: int, trajectories: int, repeats: int) -> None:
         examples = training_set.epoch(0)
         drawn = 0.0 if config is None else time.process_time() - started
         training_set.close()
-        state = RunState(flat_parameters(model).__enter__(), recipe)
+        state = RunState(FlatParameters(model), recipe)
         sets.append((model, examples, state, recipe, drawn * batch / trajectories))
     order, groups = torch.from_numpy(order_of(0, 0, trajectories)), []
     for group in range(repeats + 1):

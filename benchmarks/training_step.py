@@ -23,7 +23,7 @@ from other_libraries import JaxStep, TorchStep, inputs_of
 import offbeat as ob
 from offbeat import kernels
 from offbeat.models.zoo import recipe_of
-from offbeat.run import RunState, flat_parameters
+from offbeat.run import FlatParameters, RunState
 from offbeat.training import Examples, train_step
 
 MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
@@ -36,13 +36,17 @@ class Step(NamedTuple):
     around: Callable[[], AbstractContextManager[Any]] = nullcontext
 
 
-def offbeat_step(config: ob.ModelConfig, data: ob.Dataset, backend: str) -> Step:
+def offbeat_step(
+    config: ob.ModelConfig, data: ob.Dataset, backend: str, *, autograd: bool = False
+) -> Step:
     """A training step of Offbeat with one of its backends."""
     model = ob.make_model(config, data, seed=0)
     examples = Examples(model, model.batch(data))
     recipe = recipe_of(model.name, ob.TrainConfig(), validated=False)
-    state = RunState(flat_parameters(model).__enter__(), recipe)
+    state = RunState(FlatParameters(model), recipe)
     index = torch.arange(len(examples))
+    if autograd:  # as before `offbeat/direct.py`
+        state.direct = (model, examples, None)
 
     def step() -> float:
         return train_step(model, examples, index, state, recipe, total=1)
@@ -68,6 +72,7 @@ def steps_of(name: str, data: ob.Dataset) -> dict[str, Step]:
     found: dict[str, Step] = {}
     if kernels.cpu.instruction_sets():
         found["Offbeat, cpu"] = offbeat_step(config, data, "cpu")
+        found["Offbeat, cpu, autograd"] = offbeat_step(config, data, "cpu", autograd=True)
     found["Offbeat, reference"] = offbeat_step(config, data, "reference")
     found["eager torchdiffeq" if model.spec.field else "eager torch"] = Step(
         TorchStep(model, inputs)
@@ -129,7 +134,7 @@ def main() -> None:
         found[name] = measure(name, data, options.repeats)
         for which, numbers in found[name].items():
             print(
-                f"{name:20} {which:18} {numbers['median_ms']:8.1f} ms   "
+                f"{name:20} {which:22} {numbers['median_ms']:8.1f} ms   "
                 f"x{numbers['median_ratio_to_cpu']:.2f}",
                 flush=True,
             )

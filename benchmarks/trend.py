@@ -24,7 +24,7 @@ import offbeat as ob
 from offbeat.baselines import fit_baseline
 from offbeat.ladder import CANDIDATES
 from offbeat.models.zoo import recipe_of
-from offbeat.run import RunState, flat_parameters
+from offbeat.run import FlatParameters, RunState
 from offbeat.training import Examples, train_step
 
 TREND, PLAIN = "anchored_trend", "anchored_ode_gru_d"
@@ -41,7 +41,7 @@ def step(repeats: int) -> None:
             Examples(model, model.batch(data)),
             recipe_of(name, ob.TrainConfig(), validated=False),
         )
-        state = RunState(flat_parameters(model).__enter__(), recipe)
+        state = RunState(FlatParameters(model), recipe)
         index = torch.arange(len(examples))
 
         def run(model=model, examples=examples, index=index, state=state, recipe=recipe) -> float:

@@ -16,7 +16,7 @@ from offbeat import kernels
 from offbeat.errors import InputError
 from offbeat.kernels.triton import backend
 from offbeat.models.zoo import recipe_of
-from offbeat.run import RunState, flat_parameters
+from offbeat.run import FlatParameters, RunState
 from offbeat.sweeps.stacked import StackedModels
 from offbeat.training import Examples, train_step
 
@@ -30,7 +30,7 @@ def runs(count: int, name: str = "gru"):
         data = dataset(4, seed=seed, rows=3)
         model = ob.make_model(name, data, seed=seed, **{**SMALL, "nodes": "rows"})
         recipe = recipe_of(name, ob.TrainConfig(clip_norm=0.5), validated=False)
-        state = RunState(flat_parameters(model).__enter__(), recipe)
+        state = RunState(FlatParameters(model), recipe)
         made.append((model, Examples(model, model.batch(data)), state))
     return *(list(each) for each in zip(*made, strict=True)), recipe
 

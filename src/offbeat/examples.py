@@ -251,9 +251,16 @@ class Examples:
             taken = self.prepared.take(index, host=host)
         else:
             taken = self.prepared.take(index)
-        return self._loss(model, model.run(taken, generator=generator), index)
+        return self.loss_of(model, model.run(taken, generator=generator), index)
 
-    def _loss(self, model: BaseModel, whole: Prediction, index: Tensor) -> Tensor:
+    def loss_of(self, model: BaseModel, whole: Prediction, index: Tensor) -> Tensor:
+        """The model's loss of a prediction of some trajectories.
+
+        Args:
+            model: whose loss it is.
+            whole: (batch, rows, channels) prediction, the first row included.
+            index: (batch,) positions of the trajectories.
+        """
         index = index.to(self.targets.device)
         scale = None if whole.scale is None else whole.scale[:, 1:]
         prediction = Prediction(whole.mean[:, 1:], scale)

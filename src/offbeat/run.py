@@ -130,6 +130,7 @@ class RunState:
         self.rate_factor = 1.0  # of the learning rate; smaller after a divergence
         self.diverged = ""  # what happened, where a training ended so
         self.best: dict[str, Tensor] = {}
+        self.direct: Any = None  # of `direct.py`
 
     def set_rate(self, rate: float) -> None:
         """Sets the learning rate of the steps that follow."""

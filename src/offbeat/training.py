@@ -22,6 +22,7 @@ from offbeat.config import Recipe, TrainConfig
 from offbeat.data.shards import ShardedDataset
 from offbeat.data.trajectory import Dataset
 from offbeat.devices import resolved
+from offbeat.direct import direct_step
 from offbeat.distributed import Ranks, current, device_here, is_first, on_first
 from offbeat.errors import DivergenceError, InputError
 from offbeat.examples import (
@@ -382,6 +383,14 @@ def train_step(
         _set_rate(state, recipe, total)
         value = float(_descend_together(ranks, model, examples, index, state, recipe))
         _check_loss(value, state.epoch, state.step)
+        state.optimizer.step()
+        return value
+    if (direct := direct_step(model, examples, state, recipe)) is not None:
+        value = direct.loss(index)
+        _check_loss(value, state.epoch, state.step)
+        _set_rate(state, recipe, total)
+        direct.backward(recipe.loss_scale)
+        _clip(state, recipe)
         state.optimizer.step()
         return value
     with autocast(model, recipe.precision):

@@ -217,8 +217,14 @@ def _array(tensor: Tensor | None) -> Any:
     return tensor.detach().numpy()
 
 
-def _inputs(rows: StepInputs | TableSteps, suffix: str) -> Any:
-    made = getattr(compiled, f"StepInputs_{suffix}")
+def compiled_inputs(rows: StepInputs | TableSteps, dtype: torch.dtype) -> Any:
+    """The compiled module's form of step inputs.
+
+    Args:
+        rows: of a batch; they must live as long as the result.
+        dtype: of their numbers.
+    """
+    made = getattr(compiled, f"StepInputs_{_TYPES[dtype]}")
     fed = torch.frombuffer(bytearray(rows.fed), dtype=torch.uint8).numpy() if rows.fed else None
     if isinstance(rows, TableSteps):
         table = rows.table
@@ -242,6 +248,19 @@ def _inputs(rows: StepInputs | TableSteps, suffix: str) -> Any:
     return made(**given, use_prediction=fed)
 
 
+def tape_size(own: Any, variant: str, inputs: Any, state: Tensor) -> int | None:
+    """Numbers that a forward pass stores for its backward pass; None for the states alone.
+
+    Args:
+        own: from `compiled_spec`.
+        variant: name of an instruction set.
+        inputs: from `compiled_inputs`.
+        state: (batch, state_size) before the first step, contiguous.
+    """
+    size: int = compiled.tape_size(own, variant, inputs, _array(state))
+    return size if size * state.element_size() <= TAPE_LIMIT else None
+
+
 class _Scan(Function):
     @staticmethod
     def forward(
@@ -254,16 +273,15 @@ class _Scan(Function):
         state: Tensor,
     ) -> tuple[Tensor, Tensor]:
         own = compiled_spec(spec)
-        inputs = _inputs(rows, _TYPES[state.dtype])
+        inputs = compiled_inputs(rows, state.dtype)
         state = state.contiguous()
         first = _array(state)
         before = state.new_empty((len(rows), rows.rows, spec.state_size))
         after = torch.empty_like(before)
         tape = None
         if keep:
-            size = compiled.tape_size(own, variant, inputs, first)
-            if size * state.element_size() <= TAPE_LIMIT:
-                tape = state.new_empty(size)
+            size = tape_size(own, variant, inputs, state)
+            tape = None if size is None else state.new_empty(size)
         ctx.threads = threads()
         compiled.scan_forward(
             own, variant, _array(packed), inputs, first, _array(before), _array(after),
@@ -337,6 +355,18 @@ def compiled_perceptron(sizes: tuple[int, ...], activation: str) -> Any:
     return compiled.Perceptron(list(sizes), _ACTIVATIONS[activation])
 
 
+def perceptron_tape_size(shape: Any, variant: str, x: Tensor) -> int:
+    """Numbers that a forward pass of a perceptron stores for its backward pass.
+
+    Args:
+        shape: from `compiled_perceptron`.
+        variant: name of an instruction set.
+        x: (rows, inputs).
+    """
+    size: int = getattr(compiled, f"perceptron_tape_{_TYPES[x.dtype]}")(shape, variant, len(x))
+    return size
+
+
 class _Perceptron(Function):
     @staticmethod
     def forward(
@@ -352,8 +382,7 @@ class _Perceptron(Function):
         y = x.new_empty((len(x), sizes[-1]))
         tape = None
         if keep:
-            size = getattr(compiled, f"perceptron_tape_{_TYPES[x.dtype]}")(shape, variant, len(x))
-            tape = x.new_empty(size)
+            tape = x.new_empty(perceptron_tape_size(shape, variant, x))
         ctx.threads = threads()
         compiled.perceptron_forward(
             shape, variant, _array(packed), _array(x), _array(y), _array(tape), ctx.threads

@@ -89,7 +89,7 @@ class StackedModels:
         losses = []
         for i, (model, examples) in enumerate(zip(self.models, self.examples, strict=True)):
             predicted = model.decoded(taken[i], first[i], *each[i])
-            losses.append(examples._loss(model, predicted, indices[i]))
+            losses.append(examples.loss_of(model, predicted, indices[i]))
         for state in self.states:
             state.parameters.zero_gradient()
         (torch.stack(losses).sum() * self.recipe.loss_scale).backward()  # type: ignore[no-untyped-call]

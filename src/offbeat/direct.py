@@ -1,0 +1,309 @@
+"""Training steps on the CPU without autograd around the compiled calls.
+
+A step of a small model is a few calls of compiled code between many small operations of torch,
+which record a graph. For the models that most trainings use, the backward pass is known: this
+module calls the same compiled code in buffers that stay, with the same bits. Autograd is left for
+losses other than the mean squared error of all values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import mse_loss
+
+from offbeat.config import Recipe
+from offbeat.distributed import current
+from offbeat.examples import Examples
+from offbeat.kernels import StepTable, choose, cpu
+from offbeat.kernels.spec import ScanSpec, TableSteps
+from offbeat.models.base import BaseModel
+from offbeat.models.model import Model
+from offbeat.parts import Point
+from offbeat.parts.heads import Prediction
+from offbeat.run import RunState
+
+_MEAN = 1
+"""Reduction of a loss, as torch's operators number it."""
+
+
+def unsupported(model: BaseModel, examples: object, recipe: Recipe) -> str | None:
+    """The reason why steps need autograd; None if they do not.
+
+    Args:
+        model: that is trained.
+        examples: of the epoch.
+        recipe: of the training.
+    """
+    if current() is not None:
+        return "several ranks exchange their gradients within a step"
+    if type(model) is not Model or type(model.head) is not Point or model.acts:
+        return "only models of parts with a point head have steps that are known"
+    if type(examples) is not Examples or not isinstance(examples.prepared, StepTable):
+        return "its step inputs are not in a table"
+    if model.needs_generator or model.config.self_feeding:
+        return "self-feeding draws the steps"
+    if recipe.precision != "float32":
+        return f"its precision is {recipe.precision}"
+    choice = choose(model.spec, model.dtype, model.device)
+    if choice.backend.name != "cpu":
+        return f"its scan runs in {choice.backend.name}"
+    parts, one = model.scan_parts(), examples.prepared.take(torch.zeros(1, dtype=torch.int64))
+    if reason := cpu.unsupported(model.spec, parts, one, model.first_state(1)):
+        return reason
+    start = () if model.start is None else (model.start,)
+    trained = [*parts.tensors(), *(t for layer in model.head.layers for t in layer), *start]
+    own = list(model.parameters())
+    if sorted(map(id, trained)) != sorted(map(id, own)) or not all(p.requires_grad for p in own):
+        return "its scan computes weights from parameters"
+    return None
+
+
+class DirectStep:
+    """Losses and gradients of batches, in buffers that stay.
+
+    Args:
+        model: for which `unsupported` is None.
+        examples: of the epoch.
+        state: its parameters and their gradients.
+    """
+
+    def __init__(self, model: Model, examples: Examples, state: RunState) -> None:
+        self.model, self.examples, self.parameters = model, examples, state.parameters
+        choice = choose(model.spec, model.dtype, model.device)
+        self.choice = choice
+        self._scan = _Scan(model.spec, choice.variant)
+        self._weights = _Packed(list(model.scan_parts().tensors()))
+        layers = model.head.layers
+        self._decoder = None
+        if layers:
+            sizes = (layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers))
+            self._decoder = _Decoder(sizes, choice.variant)
+            self._decoder_weights = _Packed([t for layer in layers for t in layer])
+        self._shifted = model.config.readout == "last_row"
+        # Buffers: the first state, the states that are decoded, and gradients of states.
+        self._first = self._read = self._to_read = self._to_after = torch.empty(0)
+
+    def loss(self, index: Tensor) -> float:
+        """The loss of some trajectories; `backward` continues from it.
+
+        Args:
+            index: (batch,) positions of the trajectories.
+        """
+        rows = self.examples.prepared.take(index)
+        shape = (len(rows), rows.rows, self.model.spec.state_size)
+        if self._read.shape != shape:
+            self._first = self.model.first_state(len(rows)).detach().contiguous()
+            self._read = self._first.new_zeros(shape)
+            self._to_read, self._to_after = (
+                torch.zeros_like(self._read),
+                torch.zeros_like(self._read),
+            )
+        if self.model.start is not None:
+            self._first[:, : self.model.channels] = self.model.start.detach()
+        before, after = self._scan.forward(self._weights.gather(), rows, self._first)
+        read = before
+        if self._shifted:
+            read = self._read
+            read[:, 0], read[:, 1:] = self._first, after[:, :-1]
+        return self._loss_of(self._decode(read), index)
+
+    def _decode(self, read: Tensor) -> Tensor:
+        head = self.model.head
+        if self._decoder is None:
+            return head.anchored_values(read)
+        hidden = head.hidden(read).reshape(-1, head.hidden_size)
+        mean = self._decoder.forward(self._decoder_weights.gather(), hidden)
+        return mean.view(*read.shape[:2], -1)
+
+    def _loss_of(self, mean: Tensor, index: Tensor) -> float:
+        examples, rows = self.examples, mean.shape[1]
+        self._mean, self._targets = mean, None
+        if examples.counted is None and examples.typical is None and rows > 1:
+            self._targets = examples.targets.index_select(0, index)[:, : rows - 1]
+            return float(mse_loss(mean[:, 1:], self._targets))
+        mean.requires_grad_()
+        with torch.enable_grad():
+            self._graph = examples.loss_of(self.model, Prediction(mean), index)
+        return float(self._graph.detach())
+
+    def _gradient(self, scale: float) -> Tensor:
+        """(batch, rows, channels) of the loss with respect to the prediction."""
+        if self._targets is None:
+            (self._graph * scale).backward()  # type: ignore[no-untyped-call]
+            assert self._mean.grad is not None
+            return self._mean.grad
+        found = torch.empty_like(self._mean)
+        found[:, 0] = 0
+        factor = self._mean.new_tensor(scale)
+        torch.ops.aten.mse_loss_backward.grad_input(
+            factor, self._mean[:, 1:], self._targets, _MEAN, grad_input=found[:, 1:]
+        )
+        return found
+
+    def backward(self, scale: float) -> None:
+        """Sets the gradients of the parameters to those of the newest loss times a scale.
+
+        Args:
+            scale: of the loss.
+        """
+        to_mean = self._gradient(scale)
+        self.parameters.zero_gradient()
+        head, spec = self.model.head, self.model.spec
+        if self._decoder is None:
+            to_x, at = to_mean * head.std, slice(0, self.model.channels)
+        else:
+            to_packed, to_x = self._decoder.backward(to_mean.view(-1, self.model.channels))
+            self._decoder_weights.add(to_packed)
+            at = slice(head.anchors, head.anchors + head.hidden_size)
+        to_read = to_x.view(*to_mean.shape[:2], -1)
+        if to_read.shape[2] != spec.state_size:
+            self._to_read[..., at] = to_read
+            to_read = self._to_read
+        if self._shifted:
+            self._to_after[:, :-1] = to_read[:, 1:]
+            to_packed, to_first = self._scan.backward(None, self._to_after)
+        else:
+            to_packed, to_first = self._scan.backward(to_read, None)
+        self._weights.add(to_packed)
+        if self.model.start is not None:
+            assert self.model.start.grad is not None
+            self.model.start.grad.add_(to_first.sum(0)[: self.model.channels])
+
+
+class _Packed:
+    """Parameters in one buffer, in the order of the compiled code."""
+
+    def __init__(self, parameters: list[Any]) -> None:
+        self._parameters = parameters
+        self._flat = [p.detach().reshape(-1) for p in parameters]
+        self._buffer = torch.cat(self._flat)
+        self._sizes = [len(p) for p in self._flat]
+        self._gradients = [p.grad.view(-1) for p in parameters]
+
+    def gather(self) -> Tensor:
+        return torch.cat(self._flat, out=self._buffer)
+
+    def add(self, gradient: Tensor) -> None:
+        torch._foreach_add_(self._gradients, torch.split(gradient, self._sizes))
+
+
+class _Scan:
+    """The two calls of a scan."""
+
+    def __init__(self, spec: ScanSpec, variant: str) -> None:
+        self._spec, self._own, self._variant = spec, cpu.compiled_spec(spec), variant
+        self._tape = torch.empty(0)
+        self._states = (torch.empty(0), torch.empty(0))
+
+    def forward(self, packed: Tensor, rows: TableSteps, state: Tensor) -> tuple[Tensor, Tensor]:
+        shape = (len(rows), rows.rows, self._spec.state_size)
+        self._states = before, after = tuple(  # type: ignore[assignment]
+            each if each.shape == shape else state.new_empty(shape) for each in self._states
+        )
+        self._inputs = cpu.compiled_inputs(rows, state.dtype)
+        self._packed, self._state, self._rows = packed, state, rows
+        size = cpu.tape_size(self._own, self._variant, self._inputs, state)
+        if size is None or self._tape.numel() != size:
+            self._tape = state.new_empty(size or 0)
+        cpu.compiled.scan_forward(
+            self._own,
+            self._variant,
+            packed.numpy(),
+            self._inputs,
+            state.numpy(),
+            before.numpy(),
+            after.numpy(),
+            None if size is None else self._tape.numpy(),
+            cpu.threads(),
+        )
+        self._kept = size is not None
+        return before, after
+
+    def backward(self, to_before: Tensor | None, to_after: Tensor | None) -> tuple[Tensor, Tensor]:
+        to_packed, to_first = torch.empty_like(self._packed), torch.empty_like(self._state)
+        cpu.compiled.scan_backward(
+            self._own,
+            self._variant,
+            self._packed.numpy(),
+            self._inputs,
+            self._state.numpy(),
+            self._states[1].numpy(),
+            self._tape.numpy() if self._kept else None,
+            None if to_before is None else to_before.numpy(),
+            None if to_after is None else to_after.numpy(),
+            to_packed.numpy(),
+            to_first.numpy(),
+            cpu.threads(),
+            cpu.ROWS_AT_ONCE,
+        )
+        return to_packed, to_first
+
+
+class _Decoder:
+    """The two calls of a perceptron."""
+
+    def __init__(self, sizes: tuple[int, ...], variant: str) -> None:
+        self._own, self._variant = cpu.compiled_perceptron(sizes, "tanh"), variant
+        self._outputs = sizes[-1]
+        self._tape = torch.empty(0)
+
+    def forward(self, packed: Tensor, x: Tensor) -> Tensor:
+        size = cpu.perceptron_tape_size(self._own, self._variant, x)
+        if self._tape.numel() != size:
+            self._tape = x.new_empty(size)
+        y = x.new_empty((len(x), self._outputs))
+        self._packed, self._x = packed, x
+        cpu.compiled.perceptron_forward(
+            self._own,
+            self._variant,
+            packed.numpy(),
+            x.numpy(),
+            y.numpy(),
+            self._tape.numpy(),
+            cpu.threads(),
+        )
+        return y
+
+    def backward(self, to_y: Tensor) -> tuple[Tensor, Tensor]:
+        to_packed, to_x = torch.empty_like(self._packed), torch.empty_like(self._x)
+        cpu.compiled.perceptron_backward(
+            self._own,
+            self._variant,
+            self._packed.numpy(),
+            self._x.numpy(),
+            self._tape.numpy(),
+            to_y.numpy(),
+            to_packed.numpy(),
+            to_x.numpy(),
+            cpu.threads(),
+        )
+        return to_packed, to_x
+
+
+def direct_step(
+    model: BaseModel, examples: object, state: RunState, recipe: Recipe
+) -> DirectStep | None:
+    """The step of a training without autograd, or None where it needs that.
+
+    Args:
+        model: that is trained.
+        examples: of the epoch.
+        state: of the training; keeps the step.
+        recipe: of the training.
+    """
+    known = state.direct
+    if known is None or known[0] is not model or known[1] is not examples:
+        made = None
+        if unsupported(model, examples, recipe) is None:
+            assert isinstance(model, Model)
+            assert isinstance(examples, Examples)
+            made = DirectStep(model, examples, state)
+        known = state.direct = (model, examples, made)
+    step: DirectStep | None = known[2]
+    if step is None:
+        return None
+    own = step.model
+    return step if choose(own.spec, own.dtype, own.device) == step.choice else None
