@@ -290,7 +290,25 @@ def test_equal_rows_of_one_stamp_lose_nothing(tmp_path):
     assert dataset[0].values.tolist() == np.column_stack([tables.X, tables.Y]).tolist()
 
 
+def test_a_clock_that_is_reset_before_its_end_does_not_wrap(tmp_path):
+    for last in (2**16 - 2000, 2**15):
+        stamps = [*(last - 20 * np.arange(40)[::-1]), *(20 * np.arange(40))]
+        path = tables.write_csv(tmp_path / "log", {"time_ms": stamps, "x": range(80)})
+        dataset = read(path)
+        assert [trajectory.rows for trajectory in dataset] == [40, 40]
+        assert "wraps" not in notes(dataset)
+
+
 class TestAFolder:
+    def test_of_logs_may_hold_files_about_them(self, tmp_path):
+        self.write(tmp_path, ["a"], [{"time": tables.TIMES, **tables.XY}])
+        alone = read(tmp_path)
+        assert "files are read" not in notes(alone)
+        (tmp_path / "README.txt").write_text("Walks of a robot, see the paper.\n")
+        (tmp_path / "License.txt").write_text("MIT")
+        (tmp_path / "meta.json").write_text("{}")
+        assert read(tmp_path).fingerprint() == alone.fingerprint()
+
     def write(self, tmp_path, names, columns):
         for i, name in enumerate(names):
             own = {n: np.asarray(v) + i if n != "time" else v for n, v in columns[i].items()}

@@ -244,6 +244,21 @@ KINDS: dict[str, Kind] = {
     ),
     "millis of a board": Kind({"millis": 20 * np.arange(ROWS), **XY}, XY),
     "milliseconds since 1970": Kind({"unix_ms": NS // 10**6, **XY}, XY),
+    "a counter of microseconds of 32 bits that wraps": Kind(
+        {"time_us": (2**32 - 300_000 + STEP_NS // 1000 * np.arange(ROWS)) % 2**32, **XY},
+        XY,
+        note="a counter of 32 bits that wraps once",
+    ),
+    "a counter of milliseconds of 16 bits that wraps": Kind(
+        {"time_ms": (2**16 - 150 + 20 * np.arange(ROWS)) % 2**16, **XY},
+        XY,
+        note="a counter of 16 bits that wraps once",
+    ),
+    "a signed counter that wraps": Kind(
+        {"time_us": (2**32 - 300_000 + STEP_NS // 1000 * np.arange(ROWS)) % 2**32 - 2**31, **XY},
+        XY,
+        note="a counter of 32 bits that wraps once",
+    ),
     "rows in descending time": Kind(
         {"time": TIMES[::-1], "x": X[::-1]}, {"x": X}, note="39 of 40 rows are out of order"
     ),

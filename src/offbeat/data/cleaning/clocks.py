@@ -383,6 +383,52 @@ def _are_digits(numbers: NDArray[np.float64], parts: int) -> bool:
     return True
 
 
+_WRAPS = (16, 24, 32)  # bits of counters
+_AT_WRAP = 50  # steps from the end, and from the start, of a counter that wraps
+
+
+def without_wraps(clock: NDArray[Any]) -> tuple[NDArray[Any], str]:
+    """A clock of whole numbers that counts on where a counter of 16, 24 or 32 bits wraps.
+
+    It wraps where it falls from the last 50 steps below 2^bits (or 2^(bits - 1), where it is
+    signed) to the first 50 above 0 (or -2^(bits - 1)), and the step, modulo 2^bits, is at most
+    10 usual ones.
+
+    Args:
+        clock: (n,) integers or floats, in the order of the log.
+
+    Returns:
+        The clock, and a note; both are as given and empty where it does not wrap.
+    """
+    if len(clock) < 4:
+        return clock, ""
+    numbers = clock.astype(np.float64)
+    steps = np.diff(numbers)
+    falls = np.flatnonzero(steps < 0)
+    rises = steps[steps > 0]
+    if not len(falls) or not len(rises) or len(falls) > len(rises) // 4:
+        return clock, ""
+    usual = float(np.median(rises))
+    for bits in _WRAPS:
+        size = float(2**bits)
+        for low in (0.0, -size / 2):
+            before, after = numbers[falls], numbers[falls + 1]
+            near = (before >= low + size - _AT_WRAP * usual) & (after <= low + _AT_WRAP * usual)
+            inside = low <= numbers.min() and numbers.max() < low + size
+            if inside and near.all() and (after + size - before <= 10 * usual).all():
+                turns = np.zeros(len(clock), dtype=np.int64)
+                turns[falls + 1] = 1
+                whole = clock.dtype.kind == "f"
+                made = clock if whole else clock.astype(np.int64)
+                made = made + (np.cumsum(turns) * 2**bits).astype(made.dtype)
+                times = "once" if len(falls) == 1 else f"{len(falls)} times"
+                return (
+                    made,
+                    f"the clock is a counter of {bits} bits that wraps {times}; it counts on",
+                )
+    return clock, ""
+
+
 def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], int]:
     """Integer nanoseconds of a clock, and what the clock shows at nanosecond 0.
 

@@ -222,9 +222,9 @@ def _ordered(
         if lost > max(_FEW, before // _ONE_IN):
             raise FileFormatError(
                 f"{_where(signal, recording)}{lost} of {before} rows have the time stamp of "
-                "another row and other values. Name the column of the time, or of the sensor or "
-                "trajectory of each row (time_column=, instance_column=, trajectory_column=; of a "
-                "bag stamps=receive); duplicates=last (or first, mean) merges such rows"
+                "another row and other values. Name the column of the time, sensor or trajectory "
+                "(time_column=, instance_column=, trajectory_column=; of a bag stamps=receive), or "
+                "merge such rows with duplicates=last"
             )
     stamps, values = anomalies.one_row_per_stamp(stamps, values, options.duplicates)
     if before > len(stamps):

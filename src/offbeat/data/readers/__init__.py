@@ -208,7 +208,13 @@ def _files_of(folder: Path, format: str | None) -> list[Path]:
     if any(reader.recognises and reader.recognises(folder) for reader in of_folders):
         return []
     suffixes = {suffix for reader in READERS.values() for suffix in reader.suffixes} - {FOLDER}
-    return files_in(folder, suffixes)
+    return [path for path in files_in(folder, suffixes) if _may_be_data(path)]
+
+
+def _may_be_data(path: Path) -> bool:
+    """Whether a reader takes a file by its suffix alone, or recognises it; metadata it does not."""
+    fitting = [r for r in READERS.values() if path.suffix.lower() in r.suffixes]
+    return not fitting or any(r.recognises is None or r.recognises(path) for r in fitting)
 
 
 def _split(options: dict[str, Any], reader: Reader) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -15,10 +15,12 @@ FILES = ("auto", "episodes", "merge")
 """Ways of reading several files together; see `together`."""
 
 _MOST_FILES = 100_000
+_ABOUT = re.compile(r"(readme|licen[cs]e|changelog|citation|copying)\b", re.IGNORECASE)
+"""Names of files about a data set, which are not read with its folder."""
 
 
 def files_in(folder: Path, suffixes: Iterable[str]) -> list[Path]:
-    """The files in a folder with one of these suffixes, `ep2` before `ep10`.
+    """The files in a folder with one of these suffixes, `ep2` before `ep10`, without a README.
 
     Raises:
         FileFormatError: there are too many.
@@ -30,6 +32,7 @@ def files_in(folder: Path, suffixes: Iterable[str]) -> list[Path]:
         if (
             {path.suffix.lower(), inner} & known
             and not path.name.startswith(".")
+            and not _ABOUT.match(path.stem)
             and path.is_file()
         ):
             found.append(path)
@@ -67,12 +70,13 @@ def together(
         files = "merge" if distinct and len(read) > 1 else "episodes"
     if files == "merge":
         return [_merged(read, origin)]
-    note = f"{len(read)} files are read as episodes (files=merge merges them by their times)"
+    several = f"{len(read)} files are read as episodes (files=merge merges them by their times)"
+    told = (several,) if len(read) > 1 else ()
     made: list[Recording] = []
     for path, recordings in read:
         for recording in recordings:
             label = f"{path.stem}/{recording.label}" if recording.label else path.stem
-            made.append(replace(recording, label=label, notes=(note, *recording.notes)))
+            made.append(replace(recording, label=label, notes=(*told, *recording.notes)))
     return made
 
 

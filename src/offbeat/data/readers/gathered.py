@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import to_nanoseconds
+from offbeat.data.cleaning.clocks import to_nanoseconds, without_wraps
 from offbeat.data.readers.columns import VALUE_NAMES, Columns
 from offbeat.data.recording import Recording, Signal
 from offbeat.data.signals import MOST_CHANNELS
@@ -100,8 +100,12 @@ def recordings(
             f"{path} has two channels with the name {name!r}; rename one, or choose others "
             "with channels="
         )
+    clock = table.clock
+    if table.labels is None and shown in ("", unit):  # else other logs begin, or it is converted
+        clock, wraps = without_wraps(clock)
+        notes = (*notes, wraps) if wraps else notes
     try:
-        stamps, zero = to_nanoseconds(table.clock, unit)
+        stamps, zero = to_nanoseconds(clock, unit)
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}") from None
     made = []
