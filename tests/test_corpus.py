@@ -245,6 +245,33 @@ def test_a_comma_of_thousands_is_no_decimal_point(fields, options, expected, tmp
     assert read(tmp_path / "log.csv", **options)[0].values[:, 0].tolist() == expected
 
 
+def test_decimal_commas_stand_beside_columns_of_words(tmp_path):
+    rows = [f"0,{i:02d};{i}.500,25;{'yes' if i % 2 else 'no'};AUTO\n" for i in range(1, 40)]
+    (tmp_path / "log.csv").write_text("Zeit;x;ok;mode\n" + "".join(rows))
+    dataset = read(tmp_path / "log.csv")
+    assert dataset.names == ("x", "ok")
+    assert dataset[0].times == pytest.approx(np.arange(39) / 100)
+    assert dataset[0].values[:2].tolist() == [[1500.25, 1.0], [2500.25, 0.0]]
+
+
+def test_a_comma_that_may_be_either_is_asked_for_wherever_it_comes(tmp_path):
+    rows = "".join(f"{i};{i}\n" for i in range(1500))
+    (tmp_path / "log.csv").write_text("time;x\n" + rows + "1500;2,590\n")
+    with pytest.raises(FileFormatError, match=r"has '2,590' in line 1502.*decimal=','"):
+        read(tmp_path / "log.csv")
+    assert read(tmp_path / "log.csv", decimal=",")[0].values[-1, 0] == 2.59
+    assert read(tmp_path / "log.csv", decimal=".")[0].values[-1, 0] == 2590
+
+
+@pytest.mark.parametrize("name", ["trial", "rollout", "episode_id"])
+def test_a_trial_is_a_trajectory(name, tmp_path):
+    columns = {name: np.repeat([4, 5], tables.ROWS), "time": np.tile(tables.TIMES, 2)}
+    path = tables.write_csv(tmp_path / "log", {**columns, "x": np.tile(tables.X, 2)})
+    dataset = read(path)
+    assert dataset.meta["labels"] == ["4", "5"]
+    assert [t.values[:, 0].tolist() for t in dataset] == 2 * [tables.X.tolist()]
+
+
 def test_a_comma_that_may_be_either_is_asked_for(tmp_path):
     (tmp_path / "log.csv").write_text("time;x\n0;2,590\n1;3,100\n")
     with pytest.raises(InputError, match=r"such as '2,590'.*decimal=',' or decimal='.'"):

@@ -28,7 +28,10 @@ from offbeat.data.readers.options import names as names_of
 from offbeat.data.readers.stamps import form_of
 from offbeat.errors import FileFormatError, InputError, listed, one_of
 
-LABEL_NAMES = ("trajectory", "episode", "episode_index", "demo")
+LABEL_NAMES = (
+    *("trajectory", "episode", "episode_index", "demo", "trajectory_id", "episode_id", "demo_id"),
+    *("traj", "traj_id", "trial", "trial_id", "rollout"),
+)
 """Names of trajectory columns, in any case."""
 
 KEY_NAMES = (

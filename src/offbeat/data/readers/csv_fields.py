@@ -76,6 +76,7 @@ class Converter:
         columns: description of the table.
         missing: texts of missing values.
         decimal: the decimal separator.
+        thousands: whether a comma may separate thousands where the point is the decimal separator.
         bad: fields that are no numbers, by the position of their channel.
         known: fields that are numbers, by channel.
         rows: converted so far.
@@ -84,6 +85,7 @@ class Converter:
     columns: Columns
     missing: Sequence[str]
     decimal: str
+    thousands: bool = True
     bad: dict[int, Bad] = field(default_factory=dict)
     known: dict[int, int] = field(default_factory=dict)
     rows: int = 0
@@ -135,7 +137,7 @@ class Converter:
                 pa.string(),
             )
         texts = pc.replace_substring_regex(texts, _INFINITE, r"\1inf")
-        if self.decimal == ".":
+        if self.decimal == "." and self.thousands:
             grouped = pc.match_substring_regex(texts, _THOUSANDS)
             texts = pc.if_else(grouped, pc.replace_substring(texts, ",", ""), texts)
         fits = pc.match_substring_regex(texts, _NUMBER, ignore_case=True)

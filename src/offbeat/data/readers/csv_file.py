@@ -84,6 +84,7 @@ class CsvFile:
         layout: where its table is.
         decimal: the decimal separator; None where it is not known yet.
         missing: fields whose value is not known.
+        thousands: whether a comma may separate thousands where the point is the decimal separator.
         notes: on what was found while it was read.
         odd: rows with another number of fields.
         tail: the last bytes.
@@ -94,6 +95,7 @@ class CsvFile:
     layout: CsvLayout
     decimal: str | None
     missing: tuple[str, ...]
+    thousands: bool = True
     notes: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
     tail: list[bytes] = field(default_factory=lambda: [b""])
@@ -154,14 +156,17 @@ class CsvFile:
         )
 
     def decimal_of(self, sample: CsvSample) -> tuple[str, list[str]]:
-        """The decimal separator of the first lines, and a note where it is the comma."""
+        """The decimal separator of the first lines, and a note where it is the comma.
+
+        It is empty where they have neither points nor commas, and it is taken for the point.
+        """
         if self.layout.delimiter == ",":
             return ".", []
         fields = [f for column in sample.fields.values() for f in column]
         commas = any(_COMMA.fullmatch(f) or GROUPED_BY_POINTS.fullmatch(f) for f in fields)
         points = any("." in f and number_in(f, ".") is not None for f in fields)
         if not commas or points:
-            return ".", []
+            return ("." if commas or points else ""), []
         plain = [f for f in fields if _COMMA.fullmatch(f)]
         if plain and all(_GROUPED.fullmatch(f) for f in plain):
             first = next(f for f in fields if _COMMA.fullmatch(f))
@@ -207,9 +212,9 @@ class CsvFile:
                 types |= {columns.time: pa.float64(), columns.rest: pa.float64()}
             elif columns.time:
                 types[columns.time] = clock
-            converter = Converter(columns, self.missing, self.decimal or ".")
+            converter = Converter(columns, self.missing, self.decimal or ".", self.thousands)
             try:
-                batches = self._batches(header, columns, types, texts=not numbers_only)
+                batches = self._batches(header, columns, types)
                 if form is not None:
                     batches = with_stamps(batches, columns.time, form, self.missing)
                 elif columns.rest_unit == "date":
@@ -290,9 +295,7 @@ class CsvFile:
             return [*left, *tail] if left else []
         return [(clock, False), *(a for a in attempts if not a[1] and a[0] != clock)]
 
-    def _batches(
-        self, header: list[str], columns: Columns, types: dict[str, Any], *, texts: bool
-    ) -> Iterator[Any]:
+    def _batches(self, header: list[str], columns: Columns, types: dict[str, Any]) -> Iterator[Any]:
         import pyarrow.csv as pv
 
         self.odd.clear()
@@ -316,7 +319,7 @@ class CsvFile:
                     include_columns=columns.read,
                     null_values=nothing,
                     strings_can_be_null=False,
-                    decimal_point="." if texts else self.decimal or ".",
+                    decimal_point=self.decimal or ".",
                 ),
             ) as reader,
         ):

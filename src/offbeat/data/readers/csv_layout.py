@@ -239,7 +239,7 @@ def _header(rows: list[Row], at: int, delimiter: str) -> tuple[int | None, list[
             break
         if any(words) and all(not word or word == "-" or is_unit(word) for word in words):
             units = words
-        elif not all(word.casefold() in _TYPES for word in words):
+        elif not all(word.casefold() in _TYPES or not word.strip("-:=+") for word in words):
             break
         head -= 1
     if head < at - 1:

@@ -117,7 +117,7 @@ def read_csv(
     sample = file.sample(header)
     if decimal is None:
         decimal, more = file.decimal_of(sample)
-        file = CsvFile(text, layout, decimal, file.missing)
+        file = CsvFile(text, layout, decimal or ".", file.missing, thousands=bool(decimal))
         sample = CsvSample(sample.fields, file)
         notes += more
     named = [name for name in header if name]
