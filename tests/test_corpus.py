@@ -583,6 +583,22 @@ class TestLeRobot:
             assert dataset.roles[dataset.names.index(name)] == "state"
         assert "next.reward, complementary_info.force" in notes(dataset)
 
+    def test_names_the_times_that_it_does_not_use(self, version, tmp_path):
+        number = {"dtype": "float64", "shape": [1], "names": None}
+        episodes = [logs.logs.lerobot_episode(i, logs.ROWS) for i in range(2)]
+        features = dict(logs.logs.FEATURES)
+        for name, shift in (("observation.cam.timestamp", 0.001), ("observation.imu.time", 0.002)):
+            features[name] = number
+            for episode in episodes:
+                jitter = shift * np.sin(np.arange(logs.ROWS))
+                episode[name] = np.arange(logs.ROWS) / 20 + jitter
+        logs.logs.write_lerobot(tmp_path / "set", episodes, version=version, features=features)
+        dataset = read(tmp_path / "set")
+        assert "stamps are the column 'observation.cam.timestamp'" in notes(dataset)
+        assert "further times are left out: observation.imu.time;" in notes(dataset)
+        other = read(tmp_path / "set", time_column="observation.imu.time")
+        assert "stamps are the column 'observation.imu.time'" in notes(other)
+
     def test_refuses_stamps_that_are_all_0(self, version, tmp_path):
         path = logs.lerobot(tmp_path / "set", version, zero_stamps=True)
         with pytest.raises(FileFormatError, match="rows have the time stamp of another row"):

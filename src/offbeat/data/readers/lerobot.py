@@ -11,6 +11,7 @@ in `timestamp` or in another column, those are used; else rows are on a grid, wh
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -219,9 +220,18 @@ class _Reading:
             if not self.given and (np.abs(stamps - stamps[:1] - grid) <= near).all():
                 continue
             what = f"the column {name!r}" if not rest else f"joined from {name!r} and {rest[0]!r}"
-            return stamps, zero, unit, (f"stamps are {what}", *notes), found
+            left = self._further_times((name, *rest))
+            return stamps, zero, unit, (f"stamps are {what}", *notes, *left), found
         note = f"stamps are row number / {fps:g} fps, no times were recorded"
-        return grid, 0, "s", (note,), False
+        return grid, 0, "s", (note, *self._further_times(())), False
+
+    def _further_times(self, used: tuple[str, ...]) -> tuple[str, ...]:
+        """A note on columns of times that are neither used nor mentioned yet."""
+        told = ", ".join(self.notes)
+        names = [n for n in itertools.chain(*self.clocks) if n not in ("timestamp", *used)]
+        left = [name for name in dict.fromkeys(names) if name not in told]
+        how = "; time_column= takes one of them"
+        return (f"further times are left out: {', '.join(left[:20])}{how}",) if left else ()
 
 
 def _raw(table: Any, name: str, file: Path) -> NDArray[Any]:
