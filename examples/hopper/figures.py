@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from offbeat.plots.figures import save
 from offbeat.plots.style import INK, PAGE_WIDTH, RC, plain_ticks
 
-from .models import ABLATION, PLANS
+from .models import ABLATIONS, PLANS
 
 LINES = {"ridge": "ridge", "residual_gru": "residual GRU"}
 """Baselines whose test error is drawn as a line."""
@@ -21,7 +21,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1
 
 
 def draw(found: dict[str, Any], path: Path) -> bool:
-    """Draws validation errors at 30 % by epoch: of long trainings, and of the ablation.
+    """Draws validation errors at 30 % by epoch: of long trainings, and of the ablation over 40 epochs.
 
     Args:
         found: from `report.read`.
@@ -31,9 +31,11 @@ def draw(found: dict[str, Any], path: Path) -> bool:
         Whether there was anything to draw.
     """
     own = found["own"]
+    changed = (*ABLATIONS[40][1:], *ABLATIONS[10])
+    longer = [name for name in ABLATIONS[40] if name in own]
     parts = [
-        ("the large model", (0.006, 0.03), [n for n in PLANS if n in own and n not in ABLATION]),
-        ("changed in one thing", (0.01, 0.03), [n for n in ABLATION if n in own]),
+        ("the large model", (0.006, 0.03), [n for n in PLANS if n in own and n not in changed]),
+        ("changed in one thing", (0.01, 0.03), longer if len(longer) > 1 else []),
     ]
     parts = [part for part in parts if part[2]]
     if not parts:

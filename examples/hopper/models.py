@@ -87,17 +87,16 @@ PLANS = {
     "direct_gru": Plan("GRU without ODE", **{**_PLAIN, "model": {}, "name": DIRECT_GRU}),
 }
 
-ABLATION = (
-    "short",
-    "kept_masks",
-    "kept_windows",
-    "thesis_windows",
-    "no_linear_start",
-    "trend",
-    "small",
-    "direct_gru",
-)
-"""The large model, and plans that differ from it in one thing: all of 10 epochs."""
+_COMPILED = ("kept_masks", "kept_windows", "thesis_windows", "no_linear_start", "trend", "small")
+PLANS |= {
+    f"{name}_40": replace(PLANS[name], training={**LONG["training"]}) for name in _COMPILED
+}
+
+ABLATIONS = {
+    10: ("short", *_COMPILED, "direct_gru"),
+    40: ("large_fresh", *(f"{name}_40" for name in _COMPILED)),
+}
+"""By epochs: the large model, and plans that differ from it in one thing."""
 
 
 def train(

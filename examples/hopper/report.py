@@ -15,7 +15,7 @@ from examples.real_logs.report import document as between
 from offbeat.tables import markdown
 
 from .data import CHANNELS, FRACTIONS, PROTOCOL
-from .models import ABLATION, PLANS
+from .models import ABLATIONS, PLANS
 from .scores import AGES, record
 
 RECORDED = {
@@ -67,7 +67,8 @@ def document(text: str, found: dict[str, Any]) -> str:
     """
     for name, table in (
         ("errors", errors(found)),
-        ("ablation", ablation(found)),
+        ("ablation", ablation(found, 10)),
+        ("ablation, 40 epochs", ablation(found, 40)),
         ("curves", curves(found)),
         ("since observation", ages(found)),
         ("contacts", contacts(found)),
@@ -102,10 +103,10 @@ def errors(found: dict[str, Any]) -> str:
     return markdown(head, rows)
 
 
-def ablation(found: dict[str, Any]) -> str:
-    """A row per plan of `ABLATION`: errors, size and minutes, and the first one's error beside."""
+def ablation(found: dict[str, Any], epochs: int) -> str:
+    """A row per plan of `ABLATIONS`: errors, size and minutes, and the first one's error beside."""
     rows, first = [], None
-    for name in ABLATION:
+    for name in ABLATIONS[epochs]:
         if name not in found["own"]:
             rows.append([PLANS[name].title, *["not run"] * len(FRACTIONS), "", "", ""])
             continue
@@ -113,13 +114,13 @@ def ablation(found: dict[str, Any]) -> str:
         cells = [
             _over([run["scores"].get(str(f), {}).get("rmse") for run in each]) for f in FRACTIONS
         ]
-        error = np.mean([run["scores"]["0.3"]["rmse"] for run in each])
+        error = float(np.mean([run["scores"]["0.3"]["rmse"] for run in each]))
         first = error if first is None else first
         rows.append(
             [
                 PLANS[name].title,
                 *cells,
-                f"{round(100 * (error / first - 1)):+d} %" if name != ABLATION[0] else "",
+                f"{round(100 * (error / first - 1)):+d} %" if first is not error else "",
                 _minutes(each),
                 f"{_size(each[0]):,}",
             ]
@@ -218,8 +219,9 @@ def runs(found: dict[str, Any]) -> str:
 
 
 def _main(found: dict[str, Any]) -> list[tuple[str, list[dict[str, Any]]]]:
-    """Names and results of all predictors but those of the ablation."""
-    return [(name, each) for name, each in found["own"].items() if name not in ABLATION]
+    """Names and results of all predictors but those of the ablations."""
+    without = {*ABLATIONS[10], *ABLATIONS[40][1:]}
+    return [(name, each) for name, each in found["own"].items() if name not in without]
 
 
 def _parameters(label: str) -> int:
