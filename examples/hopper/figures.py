@@ -35,7 +35,7 @@ def draw(found: dict[str, Any], path: Path) -> bool:
     longer = [name for name in ABLATIONS[40] if name in own]
     parts = [
         ("the large model", (0.006, 0.03), [n for n in PLANS if n in own and n not in changed]),
-        ("changed in one thing", (0.01, 0.03), longer if len(longer) > 1 else []),
+        ("changed in one thing", (0.005, 0.03), longer if len(longer) > 1 else []),
     ]
     parts = [part for part in parts if part[2]]
     if not parts:
