@@ -127,7 +127,8 @@ def test_the_command_keeps_scores_and_writes_the_tables(tmp_path, monkeypatch, h
     plan = Plan("tiny", 0.3, (0.3, 0.9), options, {"epochs": 1}, linear=True)
     monkeypatch.setitem(models.PLANS, "large_fresh", plan)
     page = tmp_path / "robots.md"
-    names = ("errors", "ablation", "curves", "since observation", "contacts", "runs")
+    ablations = ("ablation", "ablation, 40 epochs")
+    names = ("errors", *ablations, "curves", "since observation", "contacts", "runs")
     page.write_text("".join(f"<!-- {n} -->\n<!-- end of {n} -->\n" for n in names))
     given = ["--only", "last_value,large_fresh", "--fractions", "0.3", "--trajectories", "40"]
     places = ["--out", str(tmp_path), "--runs", str(tmp_path / "runs"), "--document", str(page)]
