@@ -21,7 +21,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.2, 1, 1
 
 
 def draw(found: dict[str, Any], path: Path) -> bool:
-    """Draws validation errors at 30 % by epoch: of long trainings, and of the ablation over 40 epochs.
+    """Draws validation errors at 30 % by epoch: of long trainings, and of ablations of 40 epochs.
 
     Args:
         found: from `report.read`.

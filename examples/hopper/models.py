@@ -88,9 +88,7 @@ PLANS = {
 }
 
 _COMPILED = ("kept_masks", "kept_windows", "thesis_windows", "no_linear_start", "trend", "small")
-PLANS |= {
-    f"{name}_40": replace(PLANS[name], training={**LONG["training"]}) for name in _COMPILED
-}
+PLANS |= {f"{name}_40": replace(PLANS[name], training={**LONG["training"]}) for name in _COMPILED}
 
 ABLATIONS = {
     10: ("short", *_COMPILED, "direct_gru"),
