@@ -35,6 +35,7 @@ STAGES = (
     "sharded",
     "run",
     "captured",
+    "direct",
     "training",
     "ladder",
     "answers",

@@ -6,10 +6,11 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -312,6 +313,27 @@ def _recover(model: BaseModel, state: RunState, recipe: Recipe, error: Divergenc
     return False
 
 
+class StepTaker(Protocol):
+    """Takes the steps of a training; see `offbeat.sweeps.together`."""
+
+    def takes(self, model: BaseModel, examples: AnyExamples) -> bool:
+        """Whether it takes those of this training."""
+
+    def step(
+        self,
+        model: BaseModel,
+        examples: AnyExamples,
+        index: Tensor,
+        state: RunState,
+        recipe: Recipe,
+    ) -> Tensor:
+        """Takes a step; returns the loss before it."""
+
+
+STEPS: ContextVar[StepTaker | None] = ContextVar("offbeat_steps", default=None)
+"""What takes the steps of the trainings in this context; None: each training its own."""
+
+
 # --- one epoch ------------------------------------------------------------------------------------
 
 
@@ -329,13 +351,19 @@ def _epoch(
     else:
         order = order_of(recipe.seed, state.epoch, len(examples))
     steps = math.ceil(len(examples) / recipe.batch_size)
-    losses = _Losses(state)
-    elsewhere = _Elsewhere(model, examples, state, recipe, order, steps)
+    losses, taker = _Losses(state), STEPS.get()
+    if taker is not None and not taker.takes(model, examples):
+        taker = None
+    elsewhere = _Elsewhere(model, examples, state, recipe, order, 0 if taker else steps)
     started = time.perf_counter()
     done_before = state.seconds
     while state.step < steps:
         first = state.step * recipe.batch_size
-        if elsewhere.used:
+        if taker is not None:
+            index = torch.from_numpy(order[first : first + recipe.batch_size])
+            _set_rate(state, recipe, steps * recipe.epochs)
+            losses.add(taker.step(model, examples, index, state, recipe))
+        elif elsewhere.used:
             losses.add(elsewhere.step(first))
         else:
             index = torch.from_numpy(order[first : first + recipe.batch_size])
@@ -514,7 +542,7 @@ class _Elsewhere:
         order: NDArray[np.int64],
         steps: int,
     ) -> None:
-        self.used = model.device.type != "cpu" and isinstance(examples, Examples)
+        self.used = steps > 0 and model.device.type != "cpu" and isinstance(examples, Examples)
         self._model, self._examples, self._state = model, examples, state
         self._recipe, self._total = recipe, steps * recipe.epochs
         self._captured: CapturedStep | None = None

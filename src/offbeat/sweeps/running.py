@@ -22,6 +22,7 @@ from offbeat.sweeps.progress import Progress, duration
 from offbeat.sweeps.record import Group, Record, Row
 from offbeat.sweeps.session import Session
 from offbeat.sweeps.task import SCORES, Task
+from offbeat.sweeps.together import TogetherEngine, default_together
 
 if TYPE_CHECKING:
     from offbeat.comparison import Comparison
@@ -85,6 +86,7 @@ def run_plan(
     processes: int | None = None,
     threads: int = 1,
     device: str = "cpu",
+    together: int | None = None,
     budget_minutes: float | None = None,
     engine_options: Mapping[str, Any] | None = None,
     progress: bool = True,
@@ -108,6 +110,8 @@ def run_plan(
         threads: of each run.
         device: that models are trained on: `cpu`, `cuda` or `cuda:1`; `auto`, of the local engine,
             takes a GPU where there is one.
+        together: runs of equal shape that are trained in one process, whose steps are one launch
+            (`offbeat.sweeps.together`); by default 32 on a GPU with the triton backend, else 1.
         budget_minutes: stop after this time, in the middle of runs; the next call resumes them.
         engine_options: of Ray or Slurm.
         progress: show how far it is on standard error.
@@ -129,6 +133,9 @@ def run_plan(
             f"device 'auto' is that of this machine, and the engine {engine!r} runs on others; "
             "give cpu or cuda"
         )
+    together = default_together(device) if together is None else together
+    if not isinstance(together, int) or together < 1:
+        raise InputError(f"together must be an integer of at least 1, got {together!r}")
     out = writable(out, folder=True)
     asked = plan.runs() if asked is None else tuple(asked)
     out.mkdir(parents=True, exist_ok=True)
@@ -157,6 +164,8 @@ def run_plan(
                 options=engine_options,
                 folder=out / engine,
             )
+            if together > 1:
+                runner = TogetherEngine(runner, together)
             shown.say(f"{len(asked) - len(waiting)}/{len(asked)} runs done; {runner.description}")
             deadline = None if budget_minutes is None else started + 60 * budget_minutes
             session = Session(out, runner, shown, kept, tuple(tasks), here)

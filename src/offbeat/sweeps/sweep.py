@@ -141,6 +141,7 @@ def sweep(
     processes: int | None = None,
     threads: int = 1,
     device: str = "cpu",
+    together: int | None = None,
     budget_minutes: float | None = None,
     mixed: str = "refuse",
     engine_options: Mapping[str, Any] | None = None,
@@ -171,6 +172,8 @@ def sweep(
         threads: of each run.
         device: that models are trained on: `cpu`, `cuda` or `cuda:1`; `auto`, of the local engine,
             takes a GPU where there is one.
+        together: runs of equal shape that are trained in one process, whose steps are one launch
+            (`offbeat.sweeps.together`); by default 32 on a GPU with the triton backend, else 1.
         budget_minutes: stop after this time, in the middle of runs; the next call resumes them.
         mixed: what to do with runs in `out` that were made by other code, on another processor,
             with another backend, torch or data: `refuse` to continue, `accept` or `redo` them.
@@ -205,6 +208,7 @@ def sweep(
         processes=processes,
         threads=threads,
         device=device,
+        together=together,
         budget_minutes=budget_minutes,
         engine_options=engine_options,
         progress=progress,

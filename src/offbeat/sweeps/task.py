@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -95,8 +96,9 @@ class Task:
 
     def _perform(self) -> None:
         run, plan, here = self.run, self.plan, self.plan.provenance()
-        recorded = _recorded(self.recorded, self.fingerprint, plan)
-        (train, validation, test), scaler = _drawn(self)
+        with _DRAWING:
+            recorded = _recorded(self.recorded, self.fingerprint, plan)
+            (train, validation, test), scaler = _drawn(self)
         chosen, training = plan.model_config(run.model), plan.train_config(run)
         model = make_model(chosen, train, scaler=scaler, seed=run.seed_weights)
         named: dict[str, Any] = {"run_id": run.run_id, **asdict(run)}  # type: ignore[call-overload]
@@ -173,6 +175,10 @@ def _comparable(kept: Any, keys: Iterable[str]) -> dict[str, Any]:
 
 _LAST: dict[Any, tuple[Parts, Scaler]] = {}
 """The parts of the last repeat, which its models share."""
+
+
+_DRAWING = threading.RLock()
+"""Runs that are trained together are threads of one process."""
 
 
 def _drawn(task: Task) -> tuple[Parts, Scaler]:
