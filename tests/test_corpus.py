@@ -7,6 +7,7 @@ import gzip
 import json
 import lzma
 import struct
+from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -728,6 +729,35 @@ class TestArraysOfNumPy:
             Trajectory.from_arrays(np.array(["2025-01-01", "NaT"], "M8[s]"), [[1.0], [2.0]])
         with pytest.raises(InputError, match="times are masked at row 1"):
             Trajectory(np.ma.array([0.0, 1.0], mask=[False, True]), [[1.0], [2.0]])
+
+    @pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
+    def test_of_pandas_and_python_keep_their_unit(self, zone):
+        pandas = pytest.importorskip("pandas")
+        dates = pandas.DatetimeIndex(T0 + np.arange(5) * np.timedelta64(20, "ms"), tz=zone)
+        values = np.zeros((5, 1))
+        for clock in (dates, pandas.Series(dates), list(dates), dates.to_pydatetime().tolist()):
+            times = Trajectory.from_arrays(clock, values).times
+            assert times.tolist() == [0.0, 0.02, 0.04, 0.06, 0.08]
+            with pytest.raises(InputError, match=r"from_arrays takes dates"):
+                Trajectory(clock, values)
+        steps = dates - dates[0]
+        for clock in (steps, pandas.Series(steps), list(steps), steps.to_pytimedelta().tolist()):
+            for trajectory in (Trajectory(clock, values), Trajectory.from_arrays(clock, values)):
+                assert trajectory.times.tolist() == [0.0, 0.02, 0.04, 0.06, 0.08]
+
+    @pytest.mark.parametrize(
+        ("times", "values", "message"),
+        [
+            (np.arange(2) + 0j, [[1.0], [2.0]], "times are complex128, expected real numbers"),
+            ([0.0, 1.0], np.array([[T0], [T0]]), r"values are datetime64\[ns\], expected real"),
+            (["a", "b"], [[1.0], [2.0]], "times must be numbers"),
+            ([datetime(2025, 1, 1), 3], [[1.0], [2.0]], "times must all be dates"),
+            (np.arange(2).astype("m8[M]"), [[1.0], [2.0]], "which differ in length"),
+        ],
+    )
+    def test_that_are_no_times_or_values_are_refused(self, times, values, message):
+        with pytest.raises(InputError, match=message):
+            Trajectory.from_arrays(times, values)
 
     def test_that_are_masked_hold_nothing_there(self):
         values = np.ma.array([[1, 2], [3, 4]], mask=[[False, True], [False, False]])

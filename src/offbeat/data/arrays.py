@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -56,12 +57,43 @@ def without_mask(value: Any, what: str) -> Any:
     return np.where(mask, np.nan, value.data.astype(np.float64))
 
 
+def dates_of(times: Any) -> Any:
+    """Dates and durations of pandas and Python as an array of NumPy; other times as they are.
+
+    Those with an offset from UTC are in UTC.
+
+    Raises:
+        InputError: they are of several kinds.
+    """
+    if isinstance(times, np.ndarray) and times.dtype.kind != "O":
+        return times
+    kind = str(getattr(times, "dtype", ""))  # a DatetimeIndex or a Series is no array of NumPy
+    first = next(iter(times), None) if isinstance(times, list | tuple) or kind == "object" else None
+    try:
+        if kind.startswith(("datetime64", "timedelta64")):
+            return np.asarray(times, dtype=f"{kind.partition('[')[0]}[ns]")
+        if isinstance(first, datetime):
+            naive = [t.astimezone(UTC).replace(tzinfo=None) if t.tzinfo else t for t in times]
+            if len({t.tzinfo is None for t in times}) > 1:
+                raise ValueError("some have an offset from UTC and some have none")
+            return np.array(naive, dtype="datetime64[ns]")
+        if isinstance(first, timedelta):
+            return np.array(list(times), dtype="timedelta64[ns]")
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"times must all be dates, or all durations: {error}") from None
+    return times
+
+
 def since_first(clock: NDArray[Any]) -> NDArray[np.float64]:
     """Seconds since the first entry of an array of `datetime64` or `timedelta64`.
 
     Raises:
         InputError: an entry is NaT.
     """
+    if np.datetime_data(clock.dtype)[0] in ("Y", "M"):
+        if clock.dtype.kind == "m":
+            raise InputError(f"times are {clock.dtype}, which differ in length; give them in days")
+        clock = clock.astype("datetime64[s]")
     missing = np.isnat(clock)
     if missing.any():
         raise InputError(f"times have NaT at row {int(missing.argmax())}; drop that row")

@@ -12,7 +12,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.data.arrays import frozen, hand_over, since_first, without_mask
+from offbeat.data.arrays import dates_of, frozen, hand_over, since_first, without_mask
 from offbeat.errors import InputError, one_of
 
 SECONDS_PER = {
@@ -128,8 +128,8 @@ class Trajectory:
         the clock becomes float64, which avoids rounding errors.
 
         Args:
-            times: (rows,) in `time_unit`; or `datetime64` or `timedelta64`, which have a unit of
-                their own and count from the first row.
+            times: (rows,) in `time_unit`; or `datetime64` or `timedelta64`, or dates or durations
+                of pandas or Python, which have a unit of their own and count from the first row.
             values: (rows, channels) NaN where not known, or masked.
             time_unit: one of `s`, `ms`, `us`, `100ns` (ticks of Windows), `ns`, `min`, `h`, `d`.
             **fields: the other fields of `Trajectory`.
@@ -138,13 +138,13 @@ class Trajectory:
             InputError: as `Trajectory`, or an unknown unit.
         """
         factor = SECONDS_PER[one_of("time unit", time_unit, SECONDS_PER)]
-        clock = np.asarray(without_mask(times, "times"))
+        clock = np.asarray(dates_of(without_mask(times, "times")))
         if clock.dtype.kind in "mM":
             return cls(since_first(clock), values, **fields)  # type: ignore[arg-type]
         if clock.dtype.kind in "iu" and clock.size:
             clock = clock.astype(np.int64)
             clock = clock - clock.reshape(-1)[0]
-        seconds = np.asarray(clock, dtype=np.float64)
+        seconds = _array(clock, "times", "")
         # Dividing by the exact 1000 rounds once; multiplying by the inexact 0.001 rounds twice.
         seconds = seconds * factor if factor > 1 else seconds / round(1 / factor)
         return cls(seconds, values, **fields)  # type: ignore[arg-type]
@@ -237,7 +237,7 @@ def _described(
 
 def _seconds(times: Any, where: str) -> Any:
     """Times without a mask or a unit of NumPy."""
-    times = without_mask(times, f"times{where}")
+    times = dates_of(without_mask(times, f"times{where}"))
     kind = times.dtype.kind if isinstance(times, np.ndarray) else ""
     if kind == "M":
         raise InputError(
@@ -247,9 +247,12 @@ def _seconds(times: Any, where: str) -> Any:
 
 
 def _array(value: ArrayLike, what: str, where: str) -> NDArray[np.float64]:
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind and kind in "mMc":
+        raise InputError(f"{what}{where} are {value.dtype}, expected real numbers")  # type: ignore[union-attr]
     try:
         return frozen(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"{what}{where} must be numbers: {error}") from None
 
 
