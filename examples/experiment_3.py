@@ -4,9 +4,10 @@
     python examples/experiment_3.py --document docs/robots.md
 
 Robots of the Control Suite fall without control from its own random states, as the thesis' Hopper
-does. Windows of 100 rows of 5 ms or so are cut, 90 or 30 % of the rows are observed, and each row
-is predicted from the rows before it. In a repeat all predictors have the same windows, masks and
-split. All models are trained alike: Adam, cosine decay, the epoch with the lowest validation error.
+does. Windows of 100 rows, a physics step apart, are cut, 90 or 30 % of the rows are observed, and
+each row is predicted from the rows before it. In a repeat all predictors have the same windows,
+masks and split. All models are trained alike: Adam, cosine decay, the epoch with the lowest
+validation error.
 A file per robot, length, fraction, predictor and repeat is kept in `results/robots/experiment_3`;
 what is there is not run again. It needs `offbeat[sim]`.
 """

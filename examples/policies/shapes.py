@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,8 @@ SHAPES = (
     "heee",
 )
 """All of one motion each; the four of several motions are left out."""
-LEARNERS = ("kernel ridge", "MLP, last value", "GRU, gap", "ODE-RNN", "ODE-GRU-D", "anchored")
+RIDGE = {"kernel ridge": False, "kernel ridge, attracted": True}
+LEARNERS = (*RIDGE, "MLP, last value", "GRU, gap", "ODE-RNN", "ODE-GRU-D", "anchored")
 FRACTIONS = (0.3, 1.0)
 EVERY, EPOCHS, BATCH, COPIES, DROPS = 5, 300, 8, 3, Drops(frames=0.7)
 PUSH_MM, RETURNS_S = 10.0, 0.3  # of the pushes in training
@@ -70,27 +72,38 @@ def pushed(demo: ob.Trajectory, random: np.random.Generator) -> ob.Trajectory:
     return ob.Trajectory(demo.times, values, names=demo.names, units=demo.units, roles=demo.roles)
 
 
-def kernel_ridge(train: ob.Dataset, validation: ob.Dataset) -> Controller:
-    """A velocity field of positions; width and penalty are chosen on validation."""
+def kernel_ridge(train: ob.Dataset, validation: ob.Dataset, attracted: bool) -> Controller:
+    """A velocity field of positions; width and penalty are chosen on validation.
+
+    Far from the demonstrations it is zero, or, where `attracted`, points to the target with the
+    speed per distance that fits the demonstrations best.
+    """
     from sklearn.kernel_ridge import KernelRidge
 
     rows, judged = (np.concatenate([t.values for t in each]) for each in (train, validation))
+    target = np.mean([t.values[-1, :2] for t in train], axis=0)
+    away = rows[:, :2] - target
+    pull = max(0.0, -float((away * rows[:, 2:]).sum() / (away**2).sum())) if attracted else 0.0
+
+    def field(ridge: KernelRidge, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(ridge.predict(at)) - pull * (at - target)
+
     best, found = np.inf, None
     for width in (4.0, 8.0, 16.0):
         for alpha in (0.01, 0.1, 1.0):
             one = KernelRidge(kernel="rbf", gamma=0.5 / width**2, alpha=alpha)
-            one.fit(rows[:, :2], rows[:, 2:])
-            error = float(np.mean((one.predict(judged[:, :2]) - judged[:, 2:]) ** 2))
+            one.fit(rows[:, :2], rows[:, 2:] + pull * away)
+            error = float(np.mean((field(one, judged[:, :2]) - judged[:, 2:]) ** 2))
             if error < best:
                 best, found = error, one
     assert found is not None
-    return HeldController(found.predict)
+    return HeldController(partial(field, found))
 
 
 def learned(name: str, train: ob.Dataset, validation: ob.Dataset) -> Controller:
     """A controller from demonstrations."""
-    if name == "kernel ridge":
-        return kernel_ridge(train, validation)
+    if name in RIDGE:
+        return kernel_ridge(train, validation, attracted=RIDGE[name])
     model, options = options_of(name)
     fastest = 1.2 * np.max(np.abs(np.concatenate([t.values[:, 2:] for t in train])), axis=0)
     return fit_policy(

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import wilcoxon
 
 STARTS = {"seen": "seen start", "unseen": "unseen start", "pushed": "pushed", "lost": "frames lost"}
-REFERENCE = "kernel ridge"
+REFERENCE = "kernel ridge, attracted"
 FRACTIONS = (0.3, 1.0)
 
 
@@ -37,7 +37,7 @@ def table(folder: Path) -> str:
     lines = [
         f"| {len(shapes)} shapes | stamps | "
         + " | ".join(f"{name}: area, Fréchet, DTW" for name in STARTS)
-        + " | end | nearer than ridge | s |",
+        + " | end | nearer than attracted ridge | s |",
         "|---" * (len(STARTS) + 5) + "|",
     ]
     for learner in learners:
