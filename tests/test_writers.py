@@ -374,6 +374,28 @@ def test_npz_holds_masks_and_is_read_back_without_them(tmp_path):
     assert chosen[0].values[:, 0].tolist() == walk()[0].observed[:, 1].tolist()
 
 
+def test_npz_is_read_back_with_names_that_look_like_units_and_in_seconds(tmp_path):
+    times, values = 60.0 * np.arange(30), np.arange(60.0).reshape(30, 2)
+    names = ("x [m]", "y")
+    walk = ob.Dataset([ob.Trajectory(times, values, names=names, units=("", "deg"))])
+    save(walk, tmp_path / "walk.npz")
+    again = ob.read(tmp_path / "walk.npz")
+    assert (again.names, again.units) == (("x", "y"), ("m", "deg"))
+    assert again[0].times.tolist() == times.tolist()
+    assert again[0].values.tolist() == values.tolist()
+    time = ob.Trajectory(times, values, names=("time", "y"))
+    save(ob.Dataset([time]), tmp_path / "walk.npz")
+    with pytest.raises(ob.FileFormatError, match="an array of times with the name 'time'"):
+        ob.read(tmp_path / "walk.npz")
+
+
+def test_values_beyond_float32_are_not_written_as_lerobot(tmp_path):
+    walk = ob.Trajectory([0.0, 1.0], [[1e300], [0.0]], names=("x",))
+    with pytest.raises(ob.InputError, match=r"channel 'x' has values beyond 3.4e38"):
+        save(ob.Dataset([walk]), tmp_path / "walk", format="lerobot")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_options_of_a_format_are_checked(tmp_path):
     with pytest.raises(ob.InputError, match="takes no options, got 'rate_hz'"):
         save(walk(), tmp_path / "walk.csv", rate_hz=3)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import join_stamp, state_time_unit, time_column_of
+from offbeat.data.cleaning.clocks import join_stamp, split_unit, state_time_unit, time_column_of
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import LABEL_NAMES, Columns, TableOptions, stamp_columns
 from offbeat.data.readers.gathered import Coded, Coder, Gathered, recordings
@@ -79,6 +79,8 @@ def read_npz(
     if written and "clock_ns" in arrays and time_column is None:
         arrays["time_ns"] = arrays.pop("clock_ns")  # exact, while `time` counts from the first row
         arrays.pop("time", None)
+    if written and "time" in arrays and time_column in (None, "time"):
+        time_unit = time_unit or "s"
     options = TableOptions(
         time_column=time_column,
         trajectory_column=trajectory_column,
@@ -128,9 +130,17 @@ def read_npz(
     for name in options.units or {}:
         one_of("channel in units", name, table)
     stamps = [name for name in (stamp.time, stamp.rest) if name]
+    if twice := [name for name in stamps if name in table]:
+        raise FileFormatError(
+            f"{path} has a channel and an array of times with the name {twice[0]!r}; rename one, "
+            "or leave it out with without="
+        )
     options = replace(
         options,
-        units={**{n: u for n, u in stated.items() if n in table}, **(options.units or {})},
+        units={
+            **{split_unit(n)[0]: u for n, u in stated.items() if n in table and u},
+            **(options.units or {}),
+        },
         time_column=stamps or None,
         without=(),
     )

@@ -148,7 +148,14 @@ def _columns(
     features: dict[str, Any],
 ) -> Columns:
     """The columns of one episode, (rows, numbers) each."""
-    values, every = trajectory.values.astype(np.float32), [*states, *acted]
+    with np.errstate(over="ignore"):
+        values, every = trajectory.values.astype(np.float32), [*states, *acted]
+    if np.isinf(values).any():
+        channel = int(np.argwhere(np.isinf(values))[0, 1])
+        raise InputError(
+            f"LeRobot holds float32, and channel {trajectory.names[channel]!r} has values beyond "
+            "3.4e38; write another format, or in another unit"
+        )
     columns: Columns = {"observation.state": values[:, states]}
     if acted:
         columns["action"] = values[:, acted]
