@@ -44,20 +44,21 @@ def ship(folder: Path, name: str, about: str, sections: dict[str, str]) -> None:
     print(target.relative_to(ROOT))
 
 
-def thesis_models(experiment: int, models: dict[str, str], folder: Path) -> None:
+def thesis_models(experiment: int, models: dict[str, str], checkpoints: str) -> None:
     """Models on the hopper's next row, with 90 and 30 % of the rows observed.
 
     Args:
         experiment: of the thesis.
         models: titles by the names of the record.
-        folder: of the checkpoints, one per run.
+        checkpoints: path of the checkpoint of a run, with its name as `{run}`; others are left out.
     """
     with open(RECORD / "record.csv", newline="", encoding="utf-8") as file:
         record = {row["run_id"]: row for row in csv.DictReader(file)}
     for name, title in models.items():
         for percent in FRACTIONS:
             run = f"e{experiment}-{name}-{percent}-r00"
-            if not (folder / run).exists():
+            checkpoint = Path(checkpoints.format(run=run))
+            if not checkpoint.exists():
                 continue
             row = record[run]
             error, held = (
@@ -82,7 +83,7 @@ def thesis_models(experiment: int, models: dict[str, str], folder: Path) -> None
                 f"{title}: the hopper's next row, {percent} % of the rows observed; "
                 f"test RMSE {error:.4f} (last value {held:.4f})"
             )
-            ship(folder / run, f"hopper-{percent}-{name}", about, sections)
+            ship(checkpoint, f"hopper-{percent}-{name}", about, sections)
 
 
 def check_scores(out: Path) -> None:
@@ -187,10 +188,10 @@ if __name__ == "__main__":
     parser.add_argument("--lasa", type=Path, help="run of the last command in LASA")
     given = parser.parse_args()
     if given.experiment_1:
-        thesis_models(1, EXPERIMENT_1, RECORD / "models")
+        thesis_models(1, EXPERIMENT_1, f"{RECORD}/models/{{run}}")
     if given.experiment_2:
         check_scores(given.experiment_2)
-        thesis_models(2, EXPERIMENT_2, given.experiment_2 / "models")
+        thesis_models(2, EXPERIMENT_2, f"{given.experiment_2}/runs/{{run}}/training/model")
     if given.large:
         large_model(given.large)
     for robot, run in given.robot:
