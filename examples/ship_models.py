@@ -165,7 +165,7 @@ def other_model(run: Path, name: str, title: str, data: str, commands: tuple[str
         "Scores": "One step ahead on the test part, RMSE after the first observation of each "
         f"channel, in standard deviations: {of_model:.4f}; of the last value {held:.4f} "
         f"({found['trajectories']} trajectories). It is the network alone: the run blends it with "
-        "simple predictors, which is better, and gives intervals.",
+        "simple predictors and gives intervals.",
         "Licence": "Apache-2.0, as Offbeat.",
     }
     about = f"{title}; test RMSE {of_model:.4f} standard deviations (last value {held:.4f})"
