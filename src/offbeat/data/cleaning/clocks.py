@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offbeat.data.cleaning.odd_clocks import PACKED, packed
 from offbeat.errors import FileFormatError, InputError, one_of
 
 NANOSECONDS_PER = {
@@ -310,9 +311,9 @@ def state_time_unit(given: str | None, name: str, clock: ArrayLike, where: str) 
                 "they are not, state their unit with time_unit",
             ),
         )
-    if packed := _packed(numbers, folded(name)):
+    if digits := packed(numbers, folded(name)):
         raise FileFormatError(
-            f"{where} has times such as {packed} in {name!r}, whose digits are {_PACKED}; write "
+            f"{where} has times such as {digits} in {name!r}, whose digits are {PACKED}; write "
             "them as 2026-11-24T21:00:00 or 21:00:00, or give time_unit= if they are plain numbers"
         )
     unit, why = find_time_unit(clock)
@@ -341,92 +342,6 @@ def state_time_unit(given: str | None, name: str, clock: ArrayLike, where: str) 
             True,
         )
     return TimeUnit(unit, (), True)
-
-
-_PACKED = "those of a date or of hours, minutes and seconds"
-_DIGITS = ((100, 60), (100, 60), (100, 24), (100, 32), (100, 13), (10_000, 2101))
-
-
-def _packed(numbers: NDArray[np.float64], name: str) -> str:
-    """The first of numbers whose digits are a time, such as 20261124210000 and 210000; or empty.
-
-    Those of hours, minutes and seconds alone are plain numbers, too, unless they pass from 59 to
-    100 seconds or minutes, or are named `utc`.
-    """
-    if len(numbers) < 3 or (numbers < 0).any():
-        return ""
-    first = f"{numbers[0]:.15g}"
-    high = float(numbers.max())
-    if 1.9e13 < high < 2.11e13:
-        return first if _are_digits(numbers, 6) and (numbers // 1e8 % 100 > 0).all() else ""
-    if 1.9e16 < high < 2.11e16:
-        return first if _are_digits(numbers // 1000, 6) else ""
-    if not 100 < high < 240_000 or not _are_digits(numbers, 3):
-        return ""
-    seconds = numbers // 10_000 * 3600 + numbers // 100 % 100 * 60 + numbers % 100
-    steps, decoded = np.diff(numbers), np.diff(seconds)
-    if (decoded < 0).any() or (decoded == 0).all():
-        return ""
-    usual = float(np.median(decoded))
-    passes = (steps - decoded >= 40) & (decoded <= 3 * usual) & (usual < 20)
-    named = name.startswith(("utc", "gmt", "hhmmss")) and bool((numbers >= 100).all())
-    return first if passes.any() or named else ""
-
-
-def _are_digits(numbers: NDArray[np.float64], parts: int) -> bool:
-    """Whether the digits of numbers are seconds, minutes, hours, days, months and years."""
-    rest = numbers
-    for base, end in _DIGITS[:parts]:
-        if not (rest % base < end).all():
-            return False
-        rest = rest // base
-    return True
-
-
-_WRAPS = (16, 24, 32)  # bits of counters
-_AT_WRAP = 50  # steps from the end, and from the start, of a counter that wraps
-
-
-def without_wraps(clock: NDArray[Any]) -> tuple[NDArray[Any], str]:
-    """A clock of whole numbers that counts on where a counter of 16, 24 or 32 bits wraps.
-
-    It wraps where it falls from the last 50 steps below 2^bits (or 2^(bits - 1), where it is
-    signed) to the first 50 above 0 (or -2^(bits - 1)), and the step, modulo 2^bits, is at most
-    10 usual ones.
-
-    Args:
-        clock: (n,) integers or floats, in the order of the log.
-
-    Returns:
-        The clock, and a note; both are as given and empty where it does not wrap.
-    """
-    if len(clock) < 4:
-        return clock, ""
-    numbers = clock.astype(np.float64)
-    steps = np.diff(numbers)
-    falls = np.flatnonzero(steps < 0)
-    rises = steps[steps > 0]
-    if not len(falls) or not len(rises) or len(falls) > len(rises) // 4:
-        return clock, ""
-    usual = float(np.median(rises))
-    for bits in _WRAPS:
-        size = float(2**bits)
-        for low in (0.0, -size / 2):
-            before, after = numbers[falls], numbers[falls + 1]
-            near = (before >= low + size - _AT_WRAP * usual) & (after <= low + _AT_WRAP * usual)
-            inside = low <= numbers.min() and numbers.max() < low + size
-            if inside and near.all() and (after + size - before <= 10 * usual).all():
-                turns = np.zeros(len(clock), dtype=np.int64)
-                turns[falls + 1] = 1
-                whole = clock.dtype.kind == "f"
-                made = clock if whole else clock.astype(np.int64)
-                made = made + (np.cumsum(turns) * 2**bits).astype(made.dtype)
-                times = "once" if len(falls) == 1 else f"{len(falls)} times"
-                return (
-                    made,
-                    f"the clock is a counter of {bits} bits that wraps {times}; it counts on",
-                )
-    return clock, ""
 
 
 def to_nanoseconds(clock: NDArray[Any], unit: str) -> tuple[NDArray[np.int64], int]:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import to_nanoseconds, without_wraps
+from offbeat.data.cleaning.clocks import to_nanoseconds
+from offbeat.data.cleaning.odd_clocks import without_wraps
 from offbeat.data.readers.columns import VALUE_NAMES, Columns
 from offbeat.data.recording import Recording, Signal
 from offbeat.data.signals import MOST_CHANNELS
