@@ -307,6 +307,33 @@ def test_rows_that_would_be_lost_are_merged_when_asked(tmp_path):
         assert read(path, duplicates=choice)[0].values[:, 0].tolist() == expected
 
 
+@pytest.mark.parametrize("header", ["x", "x,y"])
+def test_without_times_a_row_without_a_value_is_a_row(header, tmp_path):
+    rest = "," * header.count(",")
+    rows = [f"{i}{rest}" if i % 5 else rest for i in range(40)]
+    (tmp_path / "log.csv").write_text("\n".join([header, *rows, ""]))
+    (trajectory,) = read(tmp_path / "log.csv", rate_hz=10)
+    column = trajectory.values[:, 0]
+    assert column.tolist() == pytest.approx(
+        [i if i % 5 else np.nan for i in range(40)], nan_ok=True
+    )
+    assert trajectory.times == pytest.approx(np.arange(40) / 10)
+
+
+@pytest.mark.parametrize("step", [3600, 86_400])
+def test_hours_since_1970_are_in_seconds(step, tmp_path):
+    path = tables.write_csv(
+        tmp_path / "log", {"time": 1_764_000_000 + step * np.arange(30), "x": range(30)}
+    )
+    dataset = read(path, max_gap_s=None, clock_jumps="join")
+    assert dataset.meta["time_unit"] == "s"
+
+
+def test_a_minimum_is_no_part_of_a_time(tmp_path):
+    columns = {"seconds": tables.TIMES, "min": tables.X, "max": tables.Y}
+    assert read(tables.write_csv(tmp_path / "log", columns)).names == ("min", "max")
+
+
 def test_equal_rows_of_one_stamp_lose_nothing(tmp_path):
     twice = {"time": np.repeat(tables.TIMES, 2), "x": np.repeat(tables.X, 2)}
     assert read(tables.write_csv(tmp_path / "log", twice))[0].values[:, 0].tolist() == (

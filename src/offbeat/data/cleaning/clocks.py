@@ -202,8 +202,9 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
 
     A clock that shows a date from 2000 to 2100 is in the only unit that fits its numbers:
     seconds, milliseconds, microseconds, nanoseconds or ticks of 100 ns since 1970, or ticks since
-    1601 (Windows) or the year 1 (.NET), unless its median step would then be longer than 1000 s: a
-    counter of microseconds passes such numbers after a quarter of an hour. A clock with another
+    1601 (Windows) or the year 1 (.NET), unless its median step would then be longer than 1000 s
+    and no whole number of minutes: a counter of microseconds passes such numbers after a quarter of
+    an hour. A clock with another
     origin is in seconds, unless its median step would then be longer than 10 s and three steps or
     more agree. Then it is in the unit, of `ms`, `us` and `ns`, with the rate closest to 100 Hz.
     Days since 1970, 1900 (Excel), the year 0 (MATLAB) or noon of 1 January 4713 BC (Julian) from
@@ -227,7 +228,9 @@ def find_time_unit(clock: ArrayLike) -> tuple[str, str]:
     for meaning, (unit, before) in _EPOCHS.items():
         per_second = 10**9 / NANOSECONDS_PER[unit]
         seconds = middle / per_second - before
-        if _FIRST_YEAR <= seconds <= _LAST_YEAR and step <= _SLOWEST_EPOCH_S * per_second:
+        slow = step > _SLOWEST_EPOCH_S * per_second
+        hourly = step >= 3600 * per_second and bool((steps % (60 * per_second) == 0).all())
+        if _FIRST_YEAR <= seconds <= _LAST_YEAR and (not slow or hourly):
             return unit, f"numbers near {middle:.3g} are {meaning}"
     if not step:
         return "s", ""

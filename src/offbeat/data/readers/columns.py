@@ -36,7 +36,7 @@ LABEL_NAMES = (
 
 KEY_NAMES = (
     *("channel", "variable", "signal", "sensor", "name", "key", "topic", "field", "device"),
-    *("joint", "joint_name", "sensor_name", "motor", "link", "marker", "tag", "node", "metric"),
+    *("joint", "joint_name", "sensor_name", "motor", "link", "marker", "node", "metric"),
 )
 VALUE_NAMES = ("value", "val", "data", "reading")
 """Names of the two columns of long tables besides the time, in any case."""
@@ -363,7 +363,7 @@ def stamp_columns(
 
 _DATES = ("date", "day", "date_utc", "utc_date", "local_date", "datum")
 _SECONDS = ("s", "sec", "secs", "second", "seconds")
-_MINUTES = ("min", "mins", "minute", "minutes", "hour", "hours")
+_MINUTES = ("minute", "minutes", "hour", "hours")  # min is a minimum
 
 
 def _refuse_dates(

@@ -311,6 +311,8 @@ class CsvFile:
                 parse_options=pv.ParseOptions(
                     delimiter=delimiter,
                     newlines_in_values=delimiter != " ",
+                    # Without times, a row counts, also one without a value.
+                    ignore_empty_lines=bool(columns.time) or len(header) > 1,
                     quote_char=False if delimiter == " " else '"',
                     invalid_row_handler=self._on_odd_row,
                 ),
@@ -324,7 +326,7 @@ class CsvFile:
             ) as reader,
         ):
             for batch in reader:
-                yield without_empty(batch)
+                yield without_empty(batch) if columns.time else batch
 
     def _stream(self) -> Any:
         file = self.text.bytes_from(self.layout.first)
@@ -442,7 +444,8 @@ class CsvFile:
             with self.text.bytes_from(self.layout.first) as file:
                 while block := file.read(_BLOCK):
                     ends += block.count(b"\n")
-                    returns += block.count(b"\r") - block.count(b"\r\n")
+                    if b"\r" in block:
+                        returns += block.count(b"\r") - block.count(b"\r\n")
                     tail = (tail + block)[-_TAIL:]
         except DAMAGE as error:
             raise no_text(self.path, error) from None

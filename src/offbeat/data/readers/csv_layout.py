@@ -156,6 +156,8 @@ def _layout(
     if skipped:
         notes.append(f"the header is line {rows[head][0]}; lines above it are left out")
     first = rows[at - 1][0] + 1
+    if not any(field.strip() for _, fields in rows[head + 1 : at] for field in fields):
+        first = rows[head][0] + 1  # rows without a value
     return CsvLayout(delimiter, names, rows[head][0], first, tuple(notes)), len(names) == width
 
 
