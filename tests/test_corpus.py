@@ -558,6 +558,17 @@ class TestHdf5:
                 demo["time"].attrs["units"] = "ms"
         assert read(path)[0].times == pytest.approx(logs.TICKS / 1e12)
 
+    def test_counts_on_where_its_counter_wraps(self, tmp_path):
+        path = logs.robomimic(tmp_path / "log.hdf5", times="time_us")
+        with h5py.File(path, "a") as file:
+            for demo in file["data"].values():
+                stamps = (2**32 - 300_000 + logs.TICKS // 1000) % 2**32
+                del demo["time_us"]
+                demo["time_us"] = stamps.astype(np.uint32)
+        dataset = read(path)
+        assert dataset[0].times == pytest.approx(logs.TICKS / 1e9)
+        assert "a counter of 32 bits that wraps once" in notes(dataset)
+
     def test_with_times_in_some_demonstrations_alone_is_refused(self, tmp_path):
         path = logs.robomimic(tmp_path / "log.hdf5", times="time")
         with h5py.File(path, "a") as file:

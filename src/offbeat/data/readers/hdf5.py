@@ -35,6 +35,7 @@ from offbeat.data.cleaning.clocks import (
     time_unit_in,
     to_nanoseconds,
 )
+from offbeat.data.cleaning.odd_clocks import without_wraps
 from offbeat.data.cleaning.options import is_number
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import columns_in
@@ -316,8 +317,10 @@ def _episode(
         unit, more, found = state_time_unit(
             time_unit, clock[0] if len(times) == 1 else "", clock[1], str(path)
         )
+        numbers, wraps = without_wraps(clock[1])
+        more = (*more, wraps) if wraps else more
         try:
-            stamps, zero = to_nanoseconds(clock[1], unit)
+            stamps, zero = to_nanoseconds(numbers, unit)
         except FileFormatError as error:
             raise FileFormatError(f"{path}: {clock[0]!r} of {label}: {error}") from None
         joined = len(times) == 2
