@@ -307,6 +307,47 @@ def with_models(blend):
     return fit_blend(train, validation, model, backward, tasks=blend.tasks, **members)
 
 
+def largest_steps(values: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Per channel, the largest difference of neighbouring rows, in units of its spread."""
+    return np.abs(np.diff(values, axis=0)).max(axis=0) / spread
+
+
+def test_forecasts_and_intervals_do_not_jump_in_the_asked_time(with_models):
+    """Ten times closer, neighbours differ ten times less; at a jump they would differ as before."""
+    ridge = fit_blend(
+        waves(0), waves(1, 4), tasks=with_models.tasks, causal=["ridge", "damped_slope"], count=40
+    )
+    t = waves(3, 1)[0]
+    observed = np.ones((200, 3), dtype=bool)
+    observed[180:, 0], observed[190:, 1] = False, False
+    log = ob.Dataset((replace(t, observed=observed),))
+    longest = 1.5 * with_models.stack.keys.bins.edges[-1]
+    for blend in (with_models, ridge):
+        steps = []
+        for count in (100, 1000):
+            found = ob.forecast(blend, log, np.linspace(1e-4, longest, count))[0]
+            each = np.concatenate([found.values, found.half_width(0.9)], axis=1)
+            steps.append(largest_steps(each, np.tile(blend.stack.scale, 2)))
+        assert (steps[0] > 1e-6).sum() >= 5, "they move"
+        assert (steps[1] <= 0.2 * steps[0] + 1e-9).all()
+
+
+def test_fills_and_intervals_do_not_jump_inside_a_gap(with_models):
+    t = waves(4, 1)[0]
+    steps = []
+    for count in (50, 500):
+        asked = np.linspace(t.times[90], t.times[115], count)[1:-1]
+        times = np.concatenate([t.times[:91], asked, t.times[115:]])
+        gap = np.full((count - 2, 3), np.nan)
+        values = np.concatenate([t.values[:91], gap, t.values[115:]])
+        found = with_models.fill(ob.Dataset((ob.Trajectory(times, values),)))[0]
+        inside = slice(91, 91 + len(asked))
+        each = np.concatenate([found.values[inside], found.half_width(0.9)[inside]], axis=1)
+        steps.append(largest_steps(each, np.tile(with_models.stack.scale, 2)))
+    assert (steps[0] > 1e-6).all(), "they move"
+    assert (steps[1] <= 0.2 * steps[0]).all()
+
+
 def test_a_model_with_nothing_to_say_changes_little(with_models):
     # The third channel is noise, and before the first observation nobody knows more.
     assert with_models.gamma[:-1, :2].max() < 0.3

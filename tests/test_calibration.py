@@ -197,7 +197,7 @@ def test_a_model_with_a_gaussian_head_is_blended_by_its_mean_and_scored_by_itsel
     assert answered == pytest.approx(means)
     answer = blend.causal(learned.test)[0]
     half = answer.half_widths()
-    assert half == pytest.approx(blend.widths.at(answer.key, answer.unit)), "conformal"
+    assert half == pytest.approx(blend.widths.at(answer.place, answer.unit)), "conformal"
     own = ob.evaluate(blend.forward, learned.test).scores[blend.forward.name].calibration
     mean, scale, known = found.mean, found.scale, batch.targets & (last_index(batch.mask) >= 0)
     error, spread = ((a[known]).detach().numpy() for a in (batch.values - mean, scale))

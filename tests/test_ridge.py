@@ -15,6 +15,7 @@ from offbeat.baselines.held_out import Products, held_out_ridge
 from offbeat.baselines.kernel_ridge import gaussians, whitening
 from offbeat.baselines.residual_gru import ResidualGru, step
 from offbeat.baselines.ridge_fill import backwards
+from offbeat.data.masking import masked_values
 from offbeat.data.tasks import TaskConfig, draw_tasks, take_tasks
 
 GAP = 0.01
@@ -345,6 +346,27 @@ def test_cross_fitted_predictions_are_those_of_a_fit_without_the_source():
         others = fit_baseline("ridge", take_tasks(tasks, np.flatnonzero(fold != k)))
         for i in np.flatnonzero(fold == k):
             assert found[i] == pytest.approx(others.predict(tasks[i : i + 1])[0])
+
+
+def test_windows_that_overlap_are_predicted_by_fits_to_other_times():
+    """A motion that never comes back: a fit to the same times knows it, one to others does not."""
+    random = np.random.default_rng(3)
+    times = GAP * np.arange(160)
+    walk = np.cumsum(np.cumsum(random.normal(size=(160, 2)), axis=0), axis=0)
+    tasks = draw_tasks(
+        ob.Dataset((ob.Trajectory(times, walk),)), TaskConfig(horizon_s=40 * GAP, gap_s=GAP), 24
+    )
+    rows = row_folds(tasks, 3)
+    assert len({len(np.unique(fold)) for fold in rows} - {1}), "each window has several blocks"
+    found = cross_fitted("ridge", tasks, 3)
+    fitted = fit_baseline("ridge", tasks).predict(tasks)
+    hidden = [masked_values(t) & np.logical_or.accumulate(t.observed, axis=0) for t in tasks]
+
+    def error(predicted):
+        missed = [(p - t.values)[h] for p, t, h in zip(predicted, tasks, hidden, strict=True)]
+        return float(np.sqrt(np.mean(np.concatenate(missed) ** 2)))
+
+    assert error(found) > 1.5 * error(fitted)
 
 
 def test_ridge_of_parts_of_products_is_that_of_the_examples():

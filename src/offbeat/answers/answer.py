@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, crps, half_width
+from offbeat.baselines.tables import Place
 from offbeat.data.trajectory import Trajectory
 from offbeat.errors import InputError
 
@@ -21,14 +22,14 @@ class Answer(Trajectory):
 
     Args:
         widths: half widths of intervals in units of an error, or None without intervals.
-        key: (rows, channels) kind of each value, for `widths`.
+        place: (rows, channels) where each value is between the kinds of `widths`.
         unit: (rows, channels) unit of its error, in original units; 0 where it was observed.
         beyond: (rows, channels) bool, True where a prediction is for a longer time since
             observation than was trained and validated, or at the limit of the range of training.
     """
 
     widths: HalfWidths | None = None
-    key: NDArray[np.int64] | None = None
+    place: Place | None = None
     unit: Array | None = None
     beyond: NDArray[np.bool_] | None = None
 
@@ -75,12 +76,12 @@ class Answer(Trajectory):
         Raises:
             InputError: the answer has no intervals.
         """
-        if self.widths is None or self.key is None or self.unit is None:
+        if self.widths is None or self.place is None or self.unit is None:
             raise InputError(
                 "these predictions have no intervals: they are of a model alone; fit a blend "
                 "(offbeat train, offbeat.fit_blend), whose answers have them"
             )
-        return np.asarray(self.widths.at(self.key, self.unit))
+        return np.asarray(self.widths.at(self.place, self.unit))
 
     def slice(self, start: int, stop: int) -> Answer:
         """The rows from `start` up to, not including, `stop`."""
@@ -93,7 +94,7 @@ class Answer(Trajectory):
             times=self.times[rows],
             values=self.values[rows],
             observed=None if self.observed is None else self.observed[rows],
-            key=None if self.key is None else self.key[rows],
+            place=None if self.place is None else self.place[rows],
             unit=None if self.unit is None else self.unit[rows],
             beyond=None if self.beyond is None else self.beyond[rows],
         )
@@ -115,7 +116,7 @@ class Answer(Trajectory):
         return replace(
             answer,
             widths=None if widths is None else replace(widths, table=widths.table[:, source]),
-            key=None if self.key is None else self.key[:, source],
+            place=None if self.place is None else self.place[:, source],
             unit=None if self.unit is None else np.where(still, 0.0, self.unit[:, source]),
             beyond=None if self.beyond is None else self.beyond[:, source] & ~still,
         )
@@ -132,7 +133,7 @@ class Answer(Trajectory):
             units=tuple(self.units[i] for i in order),
             roles=tuple(self.roles[i] for i in order),
             widths=None if widths is None else replace(widths, table=widths.table[:, order]),
-            key=None if self.key is None else self.key[:, order],
+            place=None if self.place is None else self.place[:, order],
             unit=None if self.unit is None else self.unit[:, order],
             beyond=None if self.beyond is None else self.beyond[:, order],
         )

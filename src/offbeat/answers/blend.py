@@ -28,10 +28,9 @@ from offbeat.answers.both_sides import (
     reversed_in_time,
 )
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
-from offbeat.baselines.base import BASELINES, Array, namespace
+from offbeat.baselines.base import BASELINES, Array, as_kind, namespace
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.kalman_groups import MotionFilter
-from offbeat.baselines.simple import as_index, as_kind, channels_of
 from offbeat.baselines.stack import (
     Stack,
     errors_of,
@@ -40,6 +39,7 @@ from offbeat.baselines.stack import (
     kinds_of,
     within,
 )
+from offbeat.baselines.tables import Place
 from offbeat.data.tasks import CAUSAL, TWO_SIDED, TaskConfig, draw_tasks
 from offbeat.data.trajectory import EXOGENOUS, Dataset
 from offbeat.data.transforms import Transforms
@@ -62,6 +62,9 @@ _SURE = 0.95
 
 TASKS = 800
 """Tasks that are drawn from the training data and from the validation data, at most."""
+
+FADED = 1.25
+"""Multiple of the longest time since observation in training at which a model has no say."""
 
 FEWEST_TASKS = 400
 """Tasks that are drawn of a short log too: regressions learn from where silences begin and end."""
@@ -126,8 +129,8 @@ class Blend:
         every = zip(dataset, self.stack.predict(dataset), kinds, strict=True)
         for i, (trajectory, base, kind) in enumerate(every):
             values, beyond = self.corrected(base, None if models is None else models[i], kind)
-            key, unit = kind[..., 0].astype(np.int64), self.stack.keys.unit(kind)
-            answers.append(self._answer(trajectory, values, self.widths, key, unit, beyond))
+            place, unit = self.stack.keys.place(kind), self.stack.keys.unit(kind)
+            answers.append(self._answer(trajectory, values, self.widths, place, unit, beyond))
         return answers
 
     def corrected(self, base: Any, model: Any, kind: Any) -> tuple[Any, Any]:
@@ -138,18 +141,21 @@ class Blend:
         Args:
             base: (rows, channels) of the stack.
             model: (rows, channels) of the forward model, or None.
-            kind: (rows, channels, 4) of `Keys.read`.
+            kind: (rows, channels, 5) of `Keys.read`.
 
         Returns:
             The answer, and where it is beyond what was trained; see `Answer.beyond`.
         """
         xp = namespace(base)
-        key, age, last = as_index(kind[..., 0]), kind[..., 2], kind[..., 3]
+        age, last, longest = kind[..., 2], kind[..., 3], float(self.stack.keys.bins.edges[-1])
         low, high = as_kind(self.stack.low, base), as_kind(self.stack.high, base)
-        beyond = age > float(self.stack.keys.bins.edges[-1]) * (1 + 1e-6)
+        beyond = age > longest * (1 + 1e-6)
         values = base
         if model is not None:
-            gamma = xp.where(beyond, 0.0, as_kind(self.gamma, base)[key, channels_of(base)])
+            # Beyond the times that it was trained for, a model has less to say, and soon nothing.
+            trusted = (FADED - xp.clip(age, 0.0, 1e300) / longest) / (FADED - 1)
+            gamma = self.stack.keys.place(kind).average(as_kind(self.gamma, base))
+            gamma = gamma * xp.clip(trusted, 0.0, 1.0)
             values = self.stack.bounded(base + gamma * (model - base), last)
         return values, beyond | (values <= low) | (values >= high)
 
@@ -157,7 +163,7 @@ class Blend:
         """(rows, channels) half widths of causal intervals, in original units.
 
         Args:
-            kind: (rows, channels, 4) of `Keys.read`.
+            kind: (rows, channels, 5) of `Keys.read`.
             level: probability of the interval.
         """
         return half_width(self.half_widths(kind), level)
@@ -168,7 +174,7 @@ class Blend:
         Args:
             kind: as of `half_width`.
         """
-        return self.widths.at(as_index(kind[..., 0]), self.stack.keys.unit(kind))
+        return self.widths.at(self.stack.keys.place(kind), self.stack.keys.unit(kind))
 
     def limited(self, values: Any) -> Any:
         """Values that are finite in all computations: within `FARTHEST` deviations of the mean."""
@@ -197,7 +203,7 @@ class Blend:
         channel = np.arange(self.channels)
         answers = []
         longest = float(self.both.keys.bins.edges[-1]) * (1 + 1e-6)
-        for trajectory, (values, key) in zip(
+        for trajectory, (values, place) in zip(
             dataset, self.both.fill(dataset, causal, models), strict=True
         ):
             sides = Sides.of(trajectory)
@@ -205,10 +211,10 @@ class Blend:
             near = np.where(sides.before, near, trajectory.values[sides.later, channel])
             near = np.where(sides.before | sides.after, near, self.stack.mean)
             values = self.stack.bounded(values, np.nan_to_num(near))
-            unit = self.both.units[key, channel]
+            unit = self.both.units[place.key, channel]
             answers.append(
                 self._answer(
-                    trajectory, values, self.both.widths, key, unit, sides.length > longest
+                    trajectory, values, self.both.widths, place, unit, sides.length > longest
                 )
             )
         return answers
@@ -218,7 +224,7 @@ class Blend:
         trajectory: Any,
         values: Array,
         widths: HalfWidths,
-        key: NDArray[np.int64],
+        place: Place,
         unit: Array,
         beyond: NDArray[np.bool_],
     ) -> Answer:
@@ -230,7 +236,7 @@ class Blend:
             roles=self.roles,
             origin=trajectory.origin,
             widths=widths,
-            key=key,
+            place=place,
             unit=unit,
             beyond=beyond,
         )
@@ -377,6 +383,7 @@ def fit_blend(
         errors.predictions[:, 0],
         None if models is None else cells.pick(models),
         train.channels,
+        cells.place,
     )
     blend = Blend(
         train.names,

@@ -36,12 +36,16 @@ from offbeat.baselines.stack import (
     members_of,
     within,
 )
+from offbeat.baselines.tables import Place
 from offbeat.baselines.weights import Errors, as_if_refitted, gate, simplex_weights, sources
 from offbeat.data.masking import masked_values
 from offbeat.data.trajectory import Dataset, Trajectory
 
 EDGE = 0.15
 """Values with s (1 - s) below this are near the edge of their gap."""
+
+NEAR, FAR = 0.1, 0.2
+"""Answers change from those near the edge to those in the middle between these."""
 
 INTERVALS = 3
 """Observed intervals on each side of a gap that say how much a channel moves."""
@@ -235,6 +239,23 @@ class SideKeys:
             key = key * self.levels + self.motion.level(trajectory, sides, at)
         return np.where(sides.before | sides.after, key, len(self) - 1).astype(np.int64)
 
+    def place(self, trajectory: Trajectory) -> Place:
+        """(rows, channels) where the values are between kinds.
+
+        Args:
+            trajectory: as of `of`.
+        """
+        sides, many, key = Sides.of(trajectory), len(self.bins), self.of(trajectory)
+        at, part = self.bins.between(sides.length)
+        at = np.where(sides.before & ~sides.after, at + 2 * many, at)
+        at = np.where(sides.after & ~sides.before, at + 3 * many, at)
+        near = sides.before | sides.after
+        middle = np.clip((sides.place * (1 - sides.place) - NEAR) / (FAR - NEAR), 0.0, 1.0)
+        middle = np.where(sides.before & sides.after, middle, 0.0)
+        key = np.where(near, at * self.levels + key % self.levels, key)
+        parts = np.where(near[..., None], np.stack([part, middle], axis=-1), 0.0)
+        return Place(key, parts, (self.levels, many * self.levels))
+
     @property
     def groups(self) -> NDArray[np.int64]:
         """(keys,) group of each kind: a length between observations, or one outside them."""
@@ -305,8 +326,8 @@ class BothSides:
         dataset: Dataset,
         causal: Sequence[Array],
         models: Sequence[Array] | None,
-    ) -> list[tuple[Array, NDArray[np.int64]]]:
-        """Fills, and the kinds of the values.
+    ) -> list[tuple[Array, Place]]:
+        """Fills, and where the values are between kinds.
 
         Args:
             dataset: in the units and the order of the channels of training.
@@ -314,16 +335,15 @@ class BothSides:
             models: the same of `model_fills`, or None without models.
         """
         every = [member.predict(dataset) for member in self.members.values()] + [list(causal)]
-        channel = np.arange(dataset.channels)
         filled = []
         for i, trajectory in enumerate(dataset):
-            key = self.keys.of(trajectory)
-            weights = self.weights[key, channel]
+            place = self.keys.place(trajectory)
+            weights = place.average(self.weights)
             base = sum(weights[..., j] * predicted[i] for j, predicted in enumerate(every))
             values = np.asarray(base)
             if models is not None:
-                values = values + self.gamma[key, channel] * (models[i] - values)
-            filled.append((values, key))
+                values = values + place.average(self.gamma) * (models[i] - values)
+            filled.append((values, place))
         return filled
 
     def arrays(self) -> dict[str, Array]:
@@ -404,21 +424,21 @@ def fit_both_sides(
         for part, p in ((train, predicted), (validation, later))
     ]
     source = sources(flat[0][0], keys.measured(usual_gaps(train.tasks)))
-    flat = [(replace(errors, source=source), models) for errors, models in flat]
+    flat = [(replace(errors, source=source), models, place) for errors, models, place in flat]
     bends = np.array([*(member.flexible for member in fitted.values()), False])
     cross = as_if_refitted(flat[0][0], flat[1][0], bends, channels)
     first = simplex_weights(cross, channels)
     weights = simplex_weights(joined([cross, flat[1][0]]), channels)
-    errors, models = flat[1]
+    errors, models, place = flat[1]
     errors = replace(errors, count=independent_tasks(keys.lengths(), validation_span_s, gap_s))
-    held_out = (first[errors.key, errors.channel] * errors.predictions).sum(axis=1)
-    gamma, answer = gated(errors, held_out, models, channels)
+    held_out = (place.average(first, errors.channel) * errors.predictions).sum(axis=1)
+    gamma, answer = gated(errors, held_out, models, channels, place)
     widths = fit_half_widths(errors, answer, channels)
     return BothSides(fitted, keys, weights, gamma, widths, units)
 
 
 def gated(
-    errors: Errors, held_out: Array, models: Array | None, channels: int
+    errors: Errors, held_out: Array, models: Array | None, channels: int, place: Place
 ) -> tuple[Array, Array]:
     """Gamma of a model, and answers for the intervals with gamma from the other half of the tasks.
 
@@ -427,6 +447,7 @@ def gated(
         held_out: (values,) base with weights that were not fitted to them.
         models: (values,) the model, or None.
         channels: their number.
+        place: (values,) where they are between kinds.
 
     Returns:
         (keys, channels), and (values,).
@@ -440,7 +461,7 @@ def gated(
         fit, use = half != k, half == k
         if fit.any():
             part = gate(errors.only(fit), held_out[fit], models[fit], channels)
-            own = part[errors.key[use], errors.channel[use]]
+            own = place[use].average(part, errors.channel[use])
             answer[use] += own * (models[use] - held_out[use])
     return gamma, answer
 
@@ -463,16 +484,19 @@ def _errors(
     predicted: Sequence[Sequence[Array]],
     models: Sequence[Array] | None,
     count: Array,
-) -> tuple[Errors, Array | None]:
+) -> tuple[Errors, Array | None, Place]:
     columns: dict[str, list[NDArray[Any]]] = {
-        n: [] for n in ("key", "channel", "task", "truth", "model")
+        n: [] for n in ("key", "channel", "task", "truth", "model", "at", "part")
     }
     each: list[Array] = []
     for i, (trajectory, line) in enumerate(zip(tasks, reference.predict(tasks), strict=True)):
         row, channel = np.nonzero(masked_values(trajectory))
         key = keys.of(trajectory)[row, channel]
         unit, zero = units[key, channel], line[row, channel]
+        place = keys.place(trajectory)[row, channel]
         columns["key"].append(key)
+        columns["at"].append(place.key)
+        columns["part"].append(place.part)
         columns["channel"].append(channel)
         columns["task"].append(np.full(len(row), i))
         columns["truth"].append((trajectory.values[row, channel] - zero) / unit)
@@ -489,7 +513,8 @@ def _errors(
         count,
         keys.groups,
     )
-    return errors, flat.get("model")
+    step = (keys.levels, len(keys.bins) * keys.levels)
+    return errors, flat.get("model"), Place(flat["at"], flat["part"], step)
 
 
 def reversed_in_time(dataset: Dataset) -> Dataset:

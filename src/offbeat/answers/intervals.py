@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.simple import as_kind, channels_of
+from offbeat.baselines.base import as_kind
+from offbeat.baselines.tables import Place
 from offbeat.baselines.weights import Errors, task_weights
 from offbeat.errors import InputError
 
@@ -37,15 +38,14 @@ class HalfWidths:
     table: Array
     count: Array
 
-    def at(self, key: Any, unit: Any) -> Any:
+    def at(self, place: Place, unit: Any) -> Any:
         """(rows, channels, levels) half widths in original units.
 
         Args:
-            key: (rows, channels) kinds of values, an array or a tensor.
-            unit: (rows, channels) unit of their errors, likewise.
+            place: (rows, channels) where values are between kinds.
+            unit: (rows, channels) unit of their errors, an array or a tensor.
         """
-        table = as_kind(self.table, unit)
-        return table[key, channels_of(unit)] * unit[..., None]
+        return place.average(as_kind(self.table, unit)) * unit[..., None]
 
 
 def fit_half_widths(errors: Errors, predicted: Array, channels: int) -> HalfWidths:

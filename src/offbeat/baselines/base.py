@@ -282,6 +282,34 @@ def namespace(array: Any) -> ModuleType:
     return torch
 
 
+def as_kind(array: Array, like: Any) -> Any:
+    """A fitted array as an array or tensor of the kind of another one."""
+    if isinstance(like, np.ndarray):
+        return array
+    import torch
+
+    return torch.as_tensor(array, dtype=like.dtype, device=like.device)
+
+
+def channels_of(like: Any) -> Any:
+    """(channels,) numbers of the channels, an index for tables.
+
+    Args:
+        like: (..., channels) array or tensor.
+    """
+    xp = namespace(like)
+    return xp.arange(like.shape[-1])
+
+
+def as_index(numbers: Any) -> Any:
+    """Whole numbers as an index for tables, int64.
+
+    Args:
+        numbers: array or tensor of floats.
+    """
+    return numbers.astype(np.int64) if isinstance(numbers, np.ndarray) else numbers.long()
+
+
 BASELINES: Registry[type[Baseline]] = Registry("baseline", group="offbeat.baselines")
 """Classes of baselines by name. A class is made without arguments and then fitted."""
 

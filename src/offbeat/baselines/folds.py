@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.baselines.base import BASELINES, Array, Baseline
-from offbeat.data.tasks import take_tasks
 from offbeat.data.trajectory import Dataset
 
 
@@ -76,25 +77,43 @@ def _sources(tasks: Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def cross_fitted(
     baseline: str | type[Baseline], tasks: Dataset, folds: int | NDArray[np.int64] = 3
 ) -> list[Array]:
-    """Predictions of every task by a baseline that was fitted to the tasks of the other folds.
+    """Predictions of every task by a baseline that was fitted to other data.
 
-    A flexible baseline predicts the tasks that it was fitted to better than others; these
-    predictions have the errors that it makes on new tasks. A single task is in its own fit.
+    A flexible baseline predicts the data that it was fitted to better than other data; these
+    predictions have the errors that it makes on new data. Where there are few sources, their
+    windows overlap: each row is predicted by a fit to what the windows have outside of its block of
+    time (`row_folds`). Data of a single row is in its own fit.
 
     Args:
         baseline: a name of the registry, or a class.
         tasks: to fit to, and to predict; from `draw_tasks`, or any data set.
-        folds: their number, see `folds_of`, or (tasks,) the fold of each.
+        folds: their number, see `row_folds`, or (tasks,) the fold of each.
 
     Returns:
         Per task (rows, channels), in original units, as of `Baseline.predict`.
     """
     kind = BASELINES[baseline] if isinstance(baseline, str) else baseline
-    fold = folds_of(tasks, folds) if isinstance(folds, int) else np.asarray(folds)
-    predicted: dict[int, Array] = {}
-    for one in np.unique(fold):
-        inside = np.flatnonzero(fold == one)
-        others = np.flatnonzero(fold != one)
-        fitted = kind().fit(take_tasks(tasks, others if len(others) else inside))
-        predicted |= dict(zip(inside.tolist(), fitted.predict(tasks.take(inside)), strict=True))
-    return [predicted[i] for i in range(len(tasks))]
+    if isinstance(folds, int):
+        fold = row_folds(tasks, folds)
+    else:
+        fold = [np.full(t.rows, f) for t, f in zip(tasks, np.asarray(folds), strict=True)]
+    predicted = [np.zeros_like(t.values) for t in tasks]
+    for one in np.unique(np.concatenate(fold)):
+        inside = np.flatnonzero([(f == one).any() for f in fold])
+        fitted = kind().fit(_outside(tasks, [f != one for f in fold]))
+        for i, rows in zip(inside.tolist(), fitted.predict(tasks.take(inside)), strict=True):
+            predicted[i] = np.where((fold[i] == one)[:, None], rows, predicted[i])
+    return predicted
+
+
+def _outside(tasks: Dataset, kept: Sequence[NDArray[np.bool_]]) -> Dataset:
+    """The stretches of tasks whose rows are kept, with at least two; all tasks without any."""
+    source, first = _sources(tasks)
+    parts, notes = [], []
+    for i, (t, keep) in enumerate(zip(tasks, kept, strict=True)):
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(int)))
+        for start, stop in ends.reshape(-1, 2).tolist():
+            if stop - start > 1:
+                parts.append(t if stop - start == t.rows else t.slice(start, stop))
+                notes.append(["", int(source[i]), int(first[i]) + start])
+    return Dataset(tuple(parts), {**tasks.meta, "tasks": notes}) if parts else tasks

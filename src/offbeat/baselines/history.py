@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import Array, State, namespace
+from offbeat.baselines.base import Array, State, as_kind, namespace
 from offbeat.data.trajectory import Dataset, Trajectory
 
 LONGEST_BIN = 24
@@ -16,6 +16,9 @@ LONGEST_BIN = 24
 
 OTHERS = 0.55
 """Others are still observed where the newest value is younger by this factor."""
+
+SURELY, HARDLY = 0.45, 0.65
+"""The same factor where they surely are, and above which they are not."""
 
 
 class History:
@@ -125,6 +128,29 @@ class AgeBins:
     def __len__(self) -> int:
         return len(self.edges)
 
+    def between(self, age: Any) -> tuple[Any, Any]:
+        """The bin whose middle is at or before each age, and how far it is on the way to the next.
+
+        Args:
+            age: (...) s, finite.
+
+        Returns:
+            (...) int64, and (...) from 0 to 1, linear in the logarithm of the age; ages before the
+            first middle and beyond the last one are at these.
+        """
+        xp = namespace(age)
+        place = 0.0 * age
+        if len(self) == 1:
+            return self.of_age(age), place
+        logs = np.log(self.middle)
+        place = place + xp.log(xp.clip(age, 1e-300, 1e300))
+        at = xp.zeros_like(place)
+        for middle in logs[1:-1]:
+            at = at + (place > float(middle))
+        at = at.astype(np.int64) if xp is np else at.long()
+        start, width = as_kind(logs[:-1], place)[at], as_kind(np.diff(logs), place)[at]
+        return at, xp.clip((place - start) / width, 0.0, 1.0)
+
     @property
     def middle(self) -> Array:
         """(bins,) s, a typical age of each bin."""
@@ -174,6 +200,18 @@ def others_seen(age: Any) -> Any:
         of the age.
     """
     return namespace(age).amin(age, -1)[..., None] < OTHERS * age
+
+
+def others_part(age: Any) -> Any:
+    """How far an outage is one of a single channel: `others_seen` without a jump, from 0 to 1.
+
+    Args:
+        age: as of `others_seen`.
+    """
+    xp = namespace(age)
+    age = xp.clip(age, 1e-12, 1e300)
+    newest = xp.amin(age, -1)[..., None]
+    return xp.clip((HARDLY * age - newest) / ((HARDLY - SURELY) * age), 0.0, 1.0)
 
 
 def usual_gaps(dataset: Dataset) -> Array:

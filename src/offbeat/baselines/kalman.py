@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import Array, Rows, State, namespace
-from offbeat.baselines.simple import as_kind
+from offbeat.baselines.base import Array, Rows, State, as_kind, namespace
 
 SERIES_BELOW = 0.3
 """Damping times gap up to which a power series is used: closed forms cancel there."""

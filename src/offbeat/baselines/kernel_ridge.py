@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.baselines.base import BASELINES, Array, namespace, product
+from offbeat.baselines.base import BASELINES, Array, as_kind, namespace, product
 from offbeat.baselines.examples import Examples
 from offbeat.baselines.ridge import Ridge
-from offbeat.baselines.simple import as_kind
 
 CENTRES, MOST, FEWEST = 1_600, 400, 100
 """Centres times channels, and most and fewest centres."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from offbeat.baselines.base import Array, State, namespace, padded, stepped
+from offbeat.baselines.base import Array, State, as_kind, namespace, padded, stepped
 from offbeat.baselines.history import AgeBins, History, filled_bins
-from offbeat.baselines.simple import DampedSlope, as_kind
+from offbeat.baselines.simple import DampedSlope
 from offbeat.data.trajectory import Dataset
 
 FORGET = 0.08

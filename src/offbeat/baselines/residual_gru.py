@@ -15,6 +15,7 @@ from offbeat.baselines.base import (
     CausalBaseline,
     Rows,
     State,
+    as_kind,
     namespace,
     padded,
     product,
@@ -22,7 +23,6 @@ from offbeat.baselines.base import (
 from offbeat.baselines.examples import some_tasks
 from offbeat.baselines.folds import folds_of
 from offbeat.baselines.history import AgeBins, History, typical_gap
-from offbeat.baselines.simple import as_kind
 from offbeat.data.tasks import take_tasks
 from offbeat.data.trajectory import Dataset
 

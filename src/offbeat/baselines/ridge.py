@@ -12,13 +12,21 @@ from offbeat.baselines.base import (
     Array,
     CausalBaseline,
     State,
+    as_kind,
+    channels_of,
     namespace,
     product,
 )
 from offbeat.baselines.examples import FURTHEST, Examples, examples_of, likeness, some_tasks
 from offbeat.baselines.held_out import held_out_ridge
-from offbeat.baselines.history import AgeBins, History, longest_age, others_seen, typical_gap
-from offbeat.baselines.simple import as_kind
+from offbeat.baselines.history import (
+    AgeBins,
+    History,
+    longest_age,
+    others_part,
+    others_seen,
+    typical_gap,
+)
 from offbeat.data.trajectory import Dataset
 
 SPANS = (1, 2, 4)
@@ -43,7 +51,8 @@ class Ridge(CausalBaseline):
     and :math:`\psi` of its own. Weights differ between the bins of `AgeBins`, and in each of them
     between an outage of all channels and one of this channel, where others were observed in the
     last 55 % of :math:`a`. A channel that was not observed yet has further weights, :math:`r = 1`
-    and the training mean as its last value.
+    and the training mean as its last value. Between the middles of two bins, the prediction is the
+    mean of those with the weights of both, so that it is continuous in time.
 
     The features of a channel are its last value, its slopes over 1, 2 and 4 intervals, and its last
     value less exponential averages over 4 typical gaps and over the longest age. :math:`\psi` is
@@ -143,18 +152,20 @@ class Ridge(CausalBaseline):
         """See `CausalBaseline`."""
         like = state["count"]
         xp = namespace(like)
-        features = self._limited(self.features(state))
-        at, relative = self.placed(History.age(state, time))
-        own = _own(features, self.moved(state), relative)
-        channel = np.arange(len(self.mean)) if xp is np else xp.arange(len(self.mean))
-        change = (own * as_kind(self.own_weight, like)[at, channel]).sum(-1)
-        bins, inputs, channels = self.weight.shape
+        features, moved = self._limited(self.features(state)), self.moved(state)
+        kinds, inputs, channels = self.weight.shape
         weight = as_kind(self.weight.transpose(1, 0, 2).reshape(inputs, -1), like)
-        each = product(self.shared(features), weight).reshape(-1, bins, channels)
-        for i in range(bins):
-            change = change + xp.where(at == i, relative * each[:, i], 0.0)
+        each = product(self.shared(features), weight).reshape(-1, kinds, channels)
+        own_weight = as_kind(self.own_weight, like)
         # Beyond what was fitted to, a change is no larger than those that were seen.
-        reach = as_kind(np.broadcast_to(self.reach, (bins, channels)).copy(), like)[at, channel]
+        most = as_kind(np.broadcast_to(self.reach, (kinds, channels)).copy(), like)
+        row, channel = xp.arange(len(each))[:, None], channels_of(like)
+        change = reach = 0.0 * like
+        for relative, several in self._near(History.age(state, time)):
+            own = _own(features, moved, relative)
+            for at, part in several:
+                found = (own * own_weight[at, channel]).sum(-1) + relative * each[row, at, channel]
+                change, reach = change + part * found, reach + part * most[at, channel]
         change = xp.minimum(xp.maximum(change, -reach), reach)
         last = History.last(state, as_kind(self.mean, like))
         predicted = last + change * as_kind(self.scale, like)
@@ -176,8 +187,23 @@ class Ridge(CausalBaseline):
         flat = namespace(flat).clip(flat, low, high) / as_kind(self.spread, flat)
         return flat.reshape(features.shape)
 
+    def _near(self, age: Any) -> list[tuple[Any, list[tuple[Any, Any]]]]:
+        """The bins before and after an age: the age over the middle, weights and their parts."""
+        xp, bins = namespace(age), AgeBins(self.edges)
+        seen, alone = age < np.inf, others_part(age)
+        age = xp.where(seen, xp.clip(age, 0.0, float(self.edges[-1])), 0.0)
+        before, part = bins.between(age)
+        after = xp.where(before < len(bins) - 1, before + 1, before)
+        found = []
+        for at, share in ((before, 1 - part), (after, part)):
+            relative = xp.where(seen, age / as_kind(bins.middle, age)[at], 1.0)
+            both = ((at, share * (1 - alone)), (at + len(bins), share * alone))
+            several = [(xp.where(seen, which, 2 * len(bins)), each) for which, each in both]
+            found.append((relative, several))
+        return found
+
     def placed(self, age: Any) -> tuple[Any, Any]:
-        """Which weights are for an age, and the age over the middle of its bin."""
+        """Which weights are fitted to an age, and the age over the middle of its bin."""
         xp = namespace(age)
         bins = AgeBins(self.edges)
         seen = age < np.inf

@@ -12,6 +12,8 @@ from offbeat.baselines.base import (
     Baseline,
     CausalBaseline,
     State,
+    as_kind,
+    channels_of,
     namespace,
     padded,
     stepped,
@@ -84,7 +86,8 @@ class ConstantVelocity(LastValue):
 class DampedSlope(ConstantVelocity):
     """Constant velocity times a factor of the channel and of the time since observation.
 
-    The factor of a bin of `AgeBins` is the least-squares one on the tasks, from 0 to 1.5.
+    The factor of a bin of `AgeBins` is the least-squares one on the tasks, from 0 to 1.5; between
+    the middles of bins it is interpolated.
     """
 
     edges: Array
@@ -115,9 +118,11 @@ class DampedSlope(ConstantVelocity):
         xp = namespace(state["count"])
         last = LastValue.read(self, state, time)
         line = super().read(state, time)
-        at = AgeBins(self.edges).of_age(History.age(state, time))
-        channel = np.arange(len(self.mean)) if xp is np else xp.arange(len(self.mean))
-        return last + as_kind(self.factor, line)[at, channel] * (line - last)
+        age = History.age(state, time)
+        at, part = AgeBins(self.edges).between(xp.where(xp.isinf(age), 0.0, age))
+        factor, channel, end = as_kind(self.factor, line), channels_of(line), len(self.edges) - 1
+        further = factor[xp.where(at < end, at + 1, end), channel]
+        return last + ((1 - part) * factor[at, channel] + part * further) * (line - last)
 
     def arrays(self) -> dict[str, Array]:
         """See `Baseline`."""
@@ -188,34 +193,6 @@ class _Of:
 
     def read(self, state: State, time: Any) -> Any:
         return self._read(self._baseline, state, time)
-
-
-def as_kind(array: Array, like: Any) -> Any:
-    """A fitted array as an array or tensor of the kind of another one."""
-    if isinstance(like, np.ndarray):
-        return array
-    import torch
-
-    return torch.as_tensor(array, dtype=like.dtype, device=like.device)
-
-
-def channels_of(like: Any) -> Any:
-    """(channels,) numbers of the channels, an index for tables.
-
-    Args:
-        like: (..., channels) array or tensor.
-    """
-    xp = namespace(like)
-    return xp.arange(like.shape[-1])
-
-
-def as_index(numbers: Any) -> Any:
-    """Whole numbers as an index for tables, int64.
-
-    Args:
-        numbers: array or tensor of floats.
-    """
-    return numbers.astype(np.int64) if isinstance(numbers, np.ndarray) else numbers.long()
 
 
 _SIMPLE: dict[str, type[Baseline]] = {

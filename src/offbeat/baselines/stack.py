@@ -15,15 +15,17 @@ from offbeat.baselines.base import (
     Baseline,
     CausalBaseline,
     State,
+    as_index,
+    as_kind,
     moments,
     namespace,
     padded,
     stepped,
 )
-from offbeat.baselines.history import AgeBins, History, others_seen, usual_gaps
+from offbeat.baselines.history import AgeBins, History, others_part, others_seen, usual_gaps
 from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.members import fit_members
-from offbeat.baselines.simple import as_index, as_kind, channels_of
+from offbeat.baselines.tables import Place
 from offbeat.baselines.weights import Errors, as_if_refitted, simplex_weights, sources
 from offbeat.data.trajectory import Dataset
 
@@ -45,6 +47,7 @@ class Cells:
         row: (values,) its row.
         channel: (values,) its channel.
         key: (values,) kind of the value, see `Keys`.
+        place: (values,) where it is between kinds.
         square: (values,) local scale.
         unit: (values,) usual size of an error, in original units.
         last: (values,) last value, or the training mean.
@@ -55,6 +58,7 @@ class Cells:
     row: NDArray[np.int64]
     channel: NDArray[np.int64]
     key: NDArray[np.int64]
+    place: Place
     square: Array
     unit: Array
     last: Array
@@ -82,7 +86,8 @@ class Keys:
     Where other channels were observed in the meantime (`others_seen`), as while one sensor is out,
     other predictors are right than where nothing was, as in a forecast: a velocity that is still
     measured gives the position. A value whose channel was never observed before has a kind of its
-    own, the last one.
+    own, the last one. Tables are fitted to the values of each kind, and interpolated between kinds
+    (`place`), so that answers are continuous in time.
 
     Attributes:
         bins: of the time since observation.
@@ -105,7 +110,7 @@ class Keys:
         return self.local.observe(state, time, values, mask)
 
     def read(self, state: State, time: Any) -> Any:
-        """(batch, channels, 4) kind, local scale, age and last value."""
+        """(batch, channels, 5) kind, local scale, age, last value, and `others_part`."""
         xp = namespace(state["count"])
         age, square = History.age(state, time), state["square"]
         level = 0.0 * square
@@ -116,7 +121,22 @@ class Keys:
         never = xp.isinf(age)
         key = xp.where(never, float(len(self) - 1), self.bins.of_age(age) * self.each + level)
         last = History.last(state, as_kind(self.local.slope.mean, square))
-        return xp.stack([key, square, age, last], -1)
+        return xp.stack([key, square, age, last, others_part(age)], -1)
+
+    def place(self, kind: Any) -> Place:
+        """Where values are between kinds.
+
+        Args:
+            kind: (..., channels, 5) of `read`, an array or a tensor.
+        """
+        xp, age = namespace(kind), kind[..., 2]
+        never = xp.isinf(age)
+        at, part = self.bins.between(xp.where(never, 0.0, age))
+        key = as_index(kind[..., 0])
+        key = xp.where(never, key, at * self.each + (key % self.each) % LEVELS)
+        alone = kind[..., 4] if self.each > LEVELS else 0.0 * part
+        parts = xp.where(never[..., None], 0.0, xp.stack([part, alone], -1))
+        return Place(key, parts, (self.each, LEVELS))
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -155,7 +175,7 @@ class Keys:
         The usual error at that time since observation, times the fourth root of the local scale.
 
         Args:
-            kind: (..., channels, 4) of `read`, an array or a tensor.
+            kind: (..., channels, 5) of `read`, an array or a tensor.
         """
         xp, age = namespace(kind), kind[..., 2]
         usual = xp.sqrt(self.local.usual_at(age))
@@ -169,13 +189,14 @@ class Keys:
         for rows in padded(tasks):
             read = stepped(self, rows)
             task, row, channel = np.nonzero(rows.known)
-            key, square, _, last = np.moveaxis(read[task, row, channel], -1, 0)
-            key = key.astype(np.int64)
-            unit = self.unit(read)[task, row, channel]
+            key, square, _, last, _ = np.moveaxis(read[task, row, channel], -1, 0)
+            place = self.place(read)[task, row, channel]
+            own = place.key, place.part, square, self.unit(read)[task, row, channel], last
             truth = rows.values[task, row, channel]
-            parts.append((task + first, row, channel, key, square, unit, last, truth))
+            parts.append((task + first, row, channel, key.astype(np.int64), *own, truth))
             first += len(rows.lengths)
-        return Cells(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        flat = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return Cells(*flat[:4], Place(flat[4], flat[5], (self.each, LEVELS)), *flat[6:])
 
 
 def independent_tasks(ages: Array, span_s: float, gap_s: float) -> Array:
@@ -225,24 +246,22 @@ class Stack(CausalBaseline):
 
     def read(self, state: State, time: Any) -> Any:
         """See `CausalBaseline`."""
-        xp = namespace(state["keys"]["count"])
-        key, _, _, last = xp.moveaxis(self.keys.read(state["keys"], time), -1, 0)
+        kind = self.keys.read(state["keys"], time)
         each = [member.read(state[name], time) for name, member in self.members.items()]
-        return self.mixed(each, key, last)
+        return self.mixed(each, kind)
 
-    def mixed(self, each: Sequence[Any], key: Any, last: Any) -> Any:
+    def mixed(self, each: Sequence[Any], kind: Any) -> Any:
         """The weighted mean of predictions.
 
         Args:
             each: (..., channels) per member.
-            key: (..., channels) kinds.
-            last: (..., channels) last values: an answer may be as far out as they are.
+            kind: (..., channels, 5) of `Keys.read`.
         """
-        weights = as_kind(self.weights, key)
-        at, channel = as_index(key), channels_of(key)
-        total = 0.0 * key
+        weights = self.keys.place(kind).average(as_kind(self.weights, kind))
+        last = kind[..., 3]
+        total = 0.0 * last
         for j, predicted in enumerate(each):
-            total = total + weights[at, channel, j] * predicted
+            total = total + weights[..., j] * predicted
         return self.bounded(total, last)
 
     def bounded(self, value: Any, last: Any) -> Any:
@@ -265,10 +284,7 @@ class Stack(CausalBaseline):
             dataset: that they predicted.
         """
         kinds = kinds_of(self.keys, dataset)
-        return [
-            self.mixed([p[i] for p in each], kind[..., 0], kind[..., 3])
-            for i, kind in enumerate(kinds)
-        ]
+        return [self.mixed([p[i] for p in each], kind) for i, kind in enumerate(kinds)]
 
     def arrays(self) -> dict[str, Array]:
         """See `Baseline`."""
@@ -328,7 +344,7 @@ def within(arrays: Mapping[str, Array], prefix: str) -> dict[str, Array]:
 
 
 def kinds_of(keys: Keys, dataset: Dataset) -> list[Array]:
-    """(rows, channels, 4) per trajectory, as `Keys.read`."""
+    """(rows, channels, 5) per trajectory, as `Keys.read`."""
     return [
         read[:length]
         for rows in padded(dataset)
