@@ -153,7 +153,7 @@ class Blend:
         values = base
         if model is not None:
             # Beyond the times that it was trained for, a model has less to say, and soon nothing.
-            trusted = (FADED - xp.clip(age, 0.0, 1e300) / longest) / (FADED - 1)
+            trusted = (FADED - xp.clip(age, 0.0, 1e30) / longest) / (FADED - 1)
             gamma = self.stack.keys.place(kind).average(as_kind(self.gamma, base))
             gamma = gamma * xp.clip(trusted, 0.0, 1.0)
             values = self.stack.bounded(base + gamma * (model - base), last)

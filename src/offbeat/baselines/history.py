@@ -143,7 +143,7 @@ class AgeBins:
         if len(self) == 1:
             return self.of_age(age), place
         logs = np.log(self.middle)
-        place = place + xp.log(xp.clip(age, 1e-300, 1e300))
+        place = place + xp.log(xp.clip(age, 1e-30, 1e30))
         at = xp.zeros_like(place)
         for middle in logs[1:-1]:
             at = at + (place > float(middle))
@@ -209,7 +209,7 @@ def others_part(age: Any) -> Any:
         age: as of `others_seen`.
     """
     xp = namespace(age)
-    age = xp.clip(age, 1e-12, 1e300)
+    age = xp.clip(age, 1e-12, 1e30)
     newest = xp.amin(age, -1)[..., None]
     return xp.clip((HARDLY * age - newest) / ((HARDLY - SURELY) * age), 0.0, 1.0)
 
