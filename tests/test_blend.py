@@ -134,6 +134,28 @@ def test_gamma_is_the_least_squares_factor():
     assert gate(few, base[:3], said[:3], 1)[0, 0] < 0.4
 
 
+def test_gamma_is_smaller_where_it_differs_between_stretches_of_the_data():
+    """The model is right by half in all of four stretches, or by 1, 1, 0 and 0."""
+    random = np.random.default_rng(0)
+    model = random.choice([-1.0, 1.0], 4000)
+    cluster = np.repeat(np.arange(4), 1000)
+    base = np.zeros(4000)
+
+    def gamma(right, cluster):
+        errors = replace(errors_from(right * model, base[:, None]), cluster=cluster)
+        return gate(errors, base, model, 1)[0, 0]
+
+    half = np.full(4000, 0.5)
+    differs = np.where(cluster < 2, 1.0, 0.0)
+    assert gamma(half, None) == pytest.approx(0.5, abs=2e-3)
+    assert gamma(half, cluster) == pytest.approx(gamma(half, None))
+    assert gamma(differs, None) == pytest.approx(0.5, abs=2e-3)
+    # Sums of a stretch miss by 1000 / 2; sqrt(4 * 500^2) / 4000 * sqrt(4 / 3)
+    error = 0.25 * np.sqrt(4 / 3)
+    assert gamma(differs, cluster) == pytest.approx(gamma(differs, None) - error)
+    assert gamma(half, 0 * cluster) == 0.0, "one stretch says nothing about the next"
+
+
 def test_gamma_of_a_channel_that_is_well_predicted_does_not_come_from_another_one():
     random = np.random.default_rng(0)
     said = random.normal(0, 1, (2, 6))

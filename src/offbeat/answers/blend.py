@@ -29,6 +29,7 @@ from offbeat.answers.both_sides import (
 )
 from offbeat.answers.intervals import HalfWidths, fit_half_widths, half_width
 from offbeat.baselines.base import BASELINES, Array, as_kind, namespace
+from offbeat.baselines.folds import clusters_of
 from offbeat.baselines.history import typical_gap
 from offbeat.baselines.kalman_groups import MotionFilter
 from offbeat.baselines.stack import (
@@ -377,7 +378,11 @@ def fit_blend(
     )
     models = model_rows(model, parts[1], seed=seed)
     count_of = independent_tasks(stack.keys.ages(), validation_span, gap)
-    errors = replace(errors_of(cells, [held_out], count_of, stack.keys.groups), source=source)
+    errors = replace(
+        errors_of(cells, [held_out], count_of, stack.keys.groups),
+        source=source,
+        cluster=clusters_of(parts[1], cells.task, cells.row),
+    )
     gamma, answer = gated(
         errors,
         errors.predictions[:, 0],

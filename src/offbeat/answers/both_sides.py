@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from offbeat.answers.intervals import HalfWidths, fit_half_widths
 from offbeat.baselines.base import Array, Baseline, fit_baseline
+from offbeat.baselines.folds import clusters_of
 from offbeat.baselines.history import AgeBins, filled_bins, usual_gaps
 from offbeat.baselines.members import fit_members
 from offbeat.baselines.stack import (
@@ -486,7 +487,7 @@ def _errors(
     count: Array,
 ) -> tuple[Errors, Array | None, Place]:
     columns: dict[str, list[NDArray[Any]]] = {
-        n: [] for n in ("key", "channel", "task", "truth", "model", "at", "part")
+        n: [] for n in ("key", "channel", "task", "truth", "model", "at", "part", "row")
     }
     each: list[Array] = []
     for i, (trajectory, line) in enumerate(zip(tasks, reference.predict(tasks), strict=True)):
@@ -499,6 +500,7 @@ def _errors(
         columns["part"].append(place.part)
         columns["channel"].append(channel)
         columns["task"].append(np.full(len(row), i))
+        columns["row"].append(row)
         columns["truth"].append((trajectory.values[row, channel] - zero) / unit)
         each.append(np.stack([(p[i][row, channel] - zero) / unit for p in predicted], axis=1))
         if models is not None:
@@ -512,6 +514,7 @@ def _errors(
         np.concatenate(each),
         count,
         keys.groups,
+        cluster=clusters_of(tasks, flat["task"], flat["row"]),
     )
     step = (keys.levels, len(keys.bins) * keys.levels)
     return errors, flat.get("model"), Place(flat["at"], flat["part"], step)

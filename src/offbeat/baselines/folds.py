@@ -66,6 +66,21 @@ def row_folds(tasks: Dataset, count: int) -> list[NDArray[np.int64]]:
     ]
 
 
+def clusters_of(
+    tasks: Dataset, task: NDArray[np.int64], row: NDArray[np.int64], count: int = 8
+) -> NDArray[np.int64]:
+    """(values,) the fold of values of tasks, see `row_folds`.
+
+    Args:
+        tasks: as of `folds_of`.
+        task: (values,) position of their task.
+        row: (values,) row in it.
+        count: of folds.
+    """
+    starts = np.cumsum([0, *(t.rows for t in tasks)])
+    return np.asarray(np.concatenate(row_folds(tasks, count))[starts[task] + row])
+
+
 def _sources(tasks: Dataset) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(tasks,) source and first row of every task."""
     notes = tasks.meta.get("tasks")

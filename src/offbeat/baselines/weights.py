@@ -64,6 +64,8 @@ class Errors:
         group: group of each key; kinds of one group are alike. By default each is its own.
         source: (keys, channels) kind whose results each kind has, where it is another one; see
             `sources`. By default each has its own.
+        cluster: (values,) stretch of the data that the value is from; what is true in one need not
+            be in the next. None where values are independent.
     """
 
     key: Integers
@@ -74,6 +76,7 @@ class Errors:
     count: Array
     group: Integers | None = None
     source: Integers | None = None
+    cluster: Integers | None = None
 
     @property
     def groups(self) -> Integers:
@@ -94,6 +97,7 @@ class Errors:
             task=self.task[chosen],
             truth=self.truth[chosen],
             predictions=self.predictions[chosen],
+            cluster=None if self.cluster is None else self.cluster[chosen],
         )
 
     def placed(self, table: Array) -> Array:
@@ -362,7 +366,8 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
 
     The least-squares factor of model - base, drawn to that of all channels of the key by `POOLED`
     tasks, and to 0 by `CAUTION`, as that of all channels is. A kind with fewer than `POOLED` tasks
-    has the factor of its group.
+    has the factor of its group. One standard error is subtracted: a factor that differs between
+    stretches of the data (`Errors.cluster`) is not one of the next stretch.
 
     Args:
         errors: on tasks that neither the base nor the model was fitted to.
@@ -410,7 +415,34 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     # No least-squares factor is larger (Cauchy and Schwarz): where the model moves much further
     # than the base is wrong, what it says in other channels does not count.
     largest = np.sqrt(least / np.maximum(square, 1e-300))
-    return errors.placed(np.clip(np.minimum(gamma, largest), 0.0, 1.0))
+    gamma = np.clip(np.minimum(gamma, largest), 0.0, 1.0)
+    return errors.placed(np.maximum(gamma - _uncertainty(errors, weight, moved, left, shape), 0.0))
+
+
+def _uncertainty(
+    errors: Errors, weight: Array, moved: Array, left: Array, shape: tuple[int, int]
+) -> Array:
+    """(keys, channels) standard error of the least-squares factor of left on moved, per group.
+
+    That of clusters (Liang and Zeger 1986, Biometrika 73(1)), whose number n enters as n / (n - 1);
+    1 where all values are of one cluster, and 0 without clusters.
+    """
+    if errors.cluster is None:
+        return np.zeros(shape)
+    groups, many = int(errors.groups.max()) + 1, int(errors.cluster.max(initial=0)) + 1
+    place = (errors.groups[errors.key] * shape[1] + errors.channel) * many + errors.cluster
+
+    def summed(value: Array) -> Array:
+        found = np.bincount(place, value, minlength=groups * shape[1] * many)
+        return np.asarray(found.reshape(groups, shape[1], many), dtype=np.float64)
+
+    cross, square = summed(weight * moved * left), summed(weight * moved**2)
+    total = np.maximum(square.sum(axis=2), 1e-300)
+    factor = np.clip(cross.sum(axis=2) / total, 0.0, 1.0)[..., None]
+    spread = np.sqrt(((cross - factor * square) ** 2).sum(axis=2)) / total
+    seen = (square > 0).sum(axis=2)
+    spread = np.where(seen > 1, spread * np.sqrt(seen / np.maximum(seen - 1, 1)), 1.0)
+    return np.asarray(spread[errors.groups])
 
 
 def _robust(missed: Array) -> Array:
