@@ -196,7 +196,9 @@ class Keys:
             parts.append((task + first, row, channel, key.astype(np.int64), *own, truth))
             first += len(rows.lengths)
         flat = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        return Cells(*flat[:4], Place(flat[4], flat[5], (self.each, LEVELS)), *flat[6:])
+        task, row, channel, key, at, part, square, unit, last, truth = flat
+        place = Place(at, part, (self.each, LEVELS))
+        return Cells(task, row, channel, key, place, square, unit, last, truth)
 
 
 def independent_tasks(ages: Array, span_s: float, gap_s: float) -> Array:
