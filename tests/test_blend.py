@@ -304,6 +304,20 @@ def test_bins_of_lengths_end_at_the_longest():
     assert edges.tolist() == pytest.approx([0.0153, 0.0306, 0.0612, 0.2])
 
 
+def test_a_channel_that_left_the_range_of_training_is_not_expected_back(blend):
+    """With half of the weight on the mean, and the channel far from it."""
+    names = list(blend.stack.members)
+    weights = np.zeros_like(blend.stack.weights)
+    weights[..., names.index("last_value")] = weights[..., names.index("mean")] = 0.5
+    stack = Stack().restore({**blend.stack.arrays(), "weights": weights})
+    t = waves(3, 1)[0]
+    for shift, drawn in ((0.0, 0.5), (100.0, 0.0)):
+        values = t.values + shift * stack.scale
+        (found,) = stack.predict(ob.Dataset((replace(t, values=values),)))
+        expected = values[:-1] + drawn * (stack.mean - values[:-1])
+        assert found[1:, :2] == pytest.approx(expected[:, :2])
+
+
 def test_a_single_wild_value_does_not_look_like_motion_for_long(blend):
     t = waves(3, 1)[0]
     values = t.values.copy()

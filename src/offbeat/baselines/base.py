@@ -42,6 +42,8 @@ class Baseline(ABC):
         causal: whether a prediction uses only what was observed before its row.
         flexible: whether it has so many parameters that its errors on the tasks it was fitted to
             are smaller than those on others; then weights are fitted to cross-validated errors.
+        located: whether it depends on where a channel is, so that it says little out of the range
+            of training.
         slow: whether its fit takes much longer than those of the others; then it is used where it
             is asked for by name.
         cost: time of its fits and predictions, about, relative to those of `damped_slope`.
@@ -51,6 +53,7 @@ class Baseline(ABC):
 
     causal: ClassVar[bool] = True
     flexible: ClassVar[bool] = False
+    located: ClassVar[bool] = False
     slow: ClassVar[bool] = False
     cost: ClassVar[float] = 1.0
 

@@ -69,6 +69,7 @@ class Ridge(CausalBaseline):
     """
 
     flexible = True
+    located = True
     cost = 60.0
 
     most_states: ClassVar[int] = 50_000  # of the tasks, that a fit uses

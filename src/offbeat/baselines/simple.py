@@ -43,6 +43,8 @@ class LastValue(CausalBaseline):
 class Mean(LastValue):
     """The training mean."""
 
+    located = True
+
     def read(self, state: State, time: Any) -> Any:
         """See `CausalBaseline`."""
         return 0.0 * state["count"] + as_kind(self.mean, state["count"])
@@ -53,6 +55,8 @@ class RunningMean(CausalBaseline):
 
     The training mean counts as ten observations.
     """
+
+    located = True
 
     PRIOR = 10.0
 

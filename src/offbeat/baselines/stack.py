@@ -34,6 +34,9 @@ ACTIVITY = (-1.5, -0.5)
 
 LEVELS = len(ACTIVITY) + 1
 
+FEW = 1e-3
+"""Weight of the last value beside the members that are used out of the range of training."""
+
 MARGIN = 0.5
 """Answers stay within the range of training, widened by this part of it on both sides."""
 
@@ -260,11 +263,18 @@ class Stack(CausalBaseline):
             kind: (..., channels, 5) of `Keys.read`.
         """
         weights = self.keys.place(kind).average(as_kind(self.weights, kind))
-        last = kind[..., 3]
-        total = 0.0 * last
-        for j, predicted in enumerate(each):
-            total = total + weights[..., j] * predicted
-        return self.bounded(total, last)
+        xp, last = namespace(kind), kind[..., 3]
+        total = located = share = 0.0 * last
+        for j, (member, predicted) in enumerate(zip(self.members.values(), each, strict=True)):
+            if member.located:
+                located = located + weights[..., j] * predicted
+            else:
+                total = total + weights[..., j] * predicted
+                share = share + weights[..., j]
+        # A channel that left the range of training, as by a drift, need not come back.
+        left = (last < as_kind(self.low, kind)) | (last > as_kind(self.high, kind))
+        elsewhere = (total + FEW * last) / (share + FEW)
+        return self.bounded(xp.where(left, elsewhere, total + located), last)
 
     def bounded(self, value: Any, last: Any) -> Any:
         """A value within the range of answers, or as near to the last value as any move was."""
