@@ -12,14 +12,15 @@ struct TimesTanhSlope {  // the derivative of tanh, computed from its value
   }
 };
 
-// y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order.
-template <int NV, bool ACCUMULATE, class Finish>
-static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x, T* y, int64_t at,
-                         const Finish& finish) {
+// y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order. P panels at a time:
+// their sums do not depend on each other, and a multiply-add takes several cycles.
+template <int P, int NV, bool ACCUMULATE, class Finish>
+static INLINE void panels(const T* w, const T* bias, int rows, int in, const T* x, T* y, int64_t at,
+                          const Finish& finish) {
   y += at;
-  constexpr int W = NV * VW;
-  V acc[TILE][NV];
-  for (int r = 0; r < TILE; ++r)
+  constexpr int W = NV * VW, R = P * TILE;
+  V acc[R][NV];
+  for (int r = 0; r < R; ++r)
     for (int v = 0; v < NV; ++v) {
       if (ACCUMULATE)
         acc[r][v] = r < rows ? load<T>(y + r * W + v * VW) : splat(0);
@@ -29,15 +30,23 @@ static INLINE void panel(const T* w, const T* bias, int rows, int in, const T* x
   for (int k = 0; k < in; ++k) {
     V xv[NV];
     for (int v = 0; v < NV; ++v) xv[v] = load<T>(x + int64_t(k) * W + v * VW);
-    for (int r = 0; r < TILE; ++r) {
-      const V wv = splat(w[k * TILE + r]);
-      for (int v = 0; v < NV; ++v) acc[r][v] = fma(wv, xv[v], acc[r][v]);
-    }
+    for (int p = 0; p < P; ++p)
+      for (int r = 0; r < TILE; ++r) {
+        const V wv = splat(w[(int64_t(p) * in + k) * TILE + r]);
+        for (int v = 0; v < NV; ++v) acc[p * TILE + r][v] = fma(wv, xv[v], acc[p * TILE + r][v]);
+      }
   }
-  for (int r = 0; r < TILE; ++r)
+  for (int r = 0; r < R; ++r)
     if (r < rows)
       for (int v = 0; v < NV; ++v)
         store<T>(y + r * W + v * VW, finish(acc[r][v], at + r * W + v * VW));
+}
+
+// Two vectors of lanes have enough sums in one panel; one vector takes half of the registers, of
+// which AVX-512 has 32 and the others 16.
+template <int NV>
+static constexpr int panels_at_once() {
+  return NV > 1 ? 1 : (VECTOR_BYTES == 64 ? 32 : 16) / 2 / TILE;
 }
 
 // The same for `LANES` lanes of a vector that is mostly empty: vectors run over the outputs of N
@@ -110,9 +119,14 @@ struct Many {
       if (VW > 4 && lanes == 3) return few<3, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
       if (VW > 4 && lanes == 4) return few<4, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
     }
-    for (int o = 0; o < out; o += TILE)
-      panel<NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
-                            out - o < TILE ? out - o : TILE, in, x, y, int64_t(o) * W, finish);
+    constexpr int P = panels_at_once<NV>(), R = P * TILE;
+    int o = 0;
+    for (; P > 1 && o + R <= out; o += R)
+      panels<P, NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, R, in, x, y,
+                                int64_t(o) * W, finish);
+    for (; o < out; o += TILE)
+      panels<1, NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
+                                out - o < TILE ? out - o : TILE, in, x, y, int64_t(o) * W, finish);
   }
   template <class Fn>
   static INLINE void each(int units, Fn fn) {
