@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
+from threading import RLock
 from typing import Any, cast
 
 import torch
@@ -42,6 +43,10 @@ are further launches. It does not change the gradients beyond rounding."""
 TRUSTED = 1e-2
 """Largest difference from the reference backend, as a fraction of the largest entry, with which
 this backend is used on a GPU; TF32 alone has 1e-3."""
+
+
+_INTERPRETER = RLock()
+"""Triton's interpreter replaces its language for all threads, so they launch one after another."""
 
 
 def interpreted() -> bool:
@@ -494,7 +499,9 @@ def options(shape: Shape) -> dict[str, Any]:
 
 
 def _on(device: torch.device) -> AbstractContextManager[Any]:
-    return torch.cuda.device(device) if device.type == "cuda" else nullcontext()
+    if device.type == "cuda":
+        return torch.cuda.device(device)
+    return _INTERPRETER if interpreted() else nullcontext()
 
 
 class _Scan(Function):
