@@ -481,7 +481,8 @@ def _instance_column(
         stamps = list(map(str, zip(stamps, sample.texts(stamp.rest), strict=False)))
     times = sample.numbers(stamp.time) if stamp.time else np.zeros(0)
     # Of stamps in whole seconds, a column may count the rows of each second.
-    coarse = stamp.rest is None and times.size and bool(((np.diff(times[np.isfinite(times)]) % 1) == 0).all())
+    whole = (np.diff(times[np.isfinite(times)]) % 1 == 0).all()
+    coarse = stamp.rest is None and times.size and bool(whole)
     shared = 5 * (len(stamps) - len(set(stamps))) >= len(stamps)  # not by chance
     usual_first = sorted(
         rest, key=lambda n: (folded(n) not in KEY_NAMES, folded(n) not in INSTANCE_NAMES)
