@@ -150,7 +150,7 @@ def test_a_unit_that_is_given_overrides_the_name_with_a_note():
         state_time_unit("y", "time", [0], "log.csv")
 
 
-def test_seconds_are_said_aloud_where_whole_numbers_name_no_unit():
+def test_seconds_are_noted_where_whole_numbers_name_no_unit():
     for step in (1, 10):
         unit, notes, found = state_time_unit(None, "time", step * np.arange(9), "log.csv")
         assert (unit, found) == ("s", True)

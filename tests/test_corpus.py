@@ -524,7 +524,7 @@ class TestMcap:
             read(path)
 
 
-def test_clocks_of_a_table_that_never_meet_are_said_aloud(tmp_path):
+def test_clocks_of_a_table_that_never_meet_are_noted(tmp_path):
     times = tables.TIMES.tolist()
     long = {
         "time": [*times, *(1_764_000_000 + t for t in times)],
@@ -679,7 +679,7 @@ def test_a_million_million_episodes_are_those_on_disk(tmp_path):
         read(path)
 
 
-def test_a_last_number_that_may_be_cut_off_is_said_aloud(tmp_path):
+def test_a_last_number_that_may_be_cut_off_is_noted(tmp_path):
     (tmp_path / "log.csv").write_text(("time,x,y\n" + tables.BODY)[:-6])
     assert "without a line end after" in notes(read(tmp_path / "log.csv"))
 

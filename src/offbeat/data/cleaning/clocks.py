@@ -258,7 +258,7 @@ _DAYS = {
 
 _FASTEST_S = 2e-5
 _SLOWEST_EPOCH_S = 1000.0
-_SLOW_S = 0.5  # a row per this time or longer is said aloud, where no unit is stated
+_SLOW_S = 0.5  # a row per this time or longer is noted, where no unit is stated
 
 
 class TimeUnit(NamedTuple):
