@@ -474,6 +474,7 @@ def test_data_of_other_channels_and_a_damaged_checkpoint_are_refused(run, data, 
         (("0.0", "0.2", "0.1"), ["--reader.order", "refuse"], ("order", "0.1")),
         (("0.0", "nan", "0.1"), [], ("time",)),
         (("0.0", "inf", "0.1"), [], ("inf",)),
+        (("0.0", "0.1", "inf", "inf", "0.2"), [], ("inf",)),
     ],
 )
 def test_times_that_cannot_be_used_are_named(run, data, tmp_path, capsys, times, options, said):

@@ -151,5 +151,6 @@ def test_an_error_of_a_step_reaches_every_run(monkeypatch: pytest.MonkeyPatch) -
 
 def test_on_a_cpu_each_run_is_trained_alone_unless_told_otherwise(tmp_path: Path) -> None:
     assert default_together("cpu") == 1
+    assert default_together("not a device") == 1
     with pytest.raises(ob.InputError, match="together must be an integer of at least 1, got 0"):
         ob.sweep(DATA, MODELS, out=tmp_path / "out", together=0)

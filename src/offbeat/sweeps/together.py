@@ -38,7 +38,7 @@ def default_together(device: str) -> int:
     Args:
         device: that models are trained on.
     """
-    on_gpu = torch.device(device).type == "cuda"
+    on_gpu = device.partition(":")[0] == "cuda"  # of this machine or of another one
     return ON_A_GPU if on_gpu and not triton_backend.why_not() else 1
 
 

@@ -66,9 +66,9 @@ def without_wraps(clock: NDArray[Any]) -> tuple[NDArray[Any], str]:
     Returns:
         The clock, and a note; both are as given and empty where it does not wrap.
     """
-    if len(clock) < 4:
-        return clock, ""
     numbers = clock.astype(np.float64)
+    if len(clock) < 4 or not np.isfinite(numbers).all():
+        return clock, ""
     steps = np.diff(numbers)
     falls = np.flatnonzero(steps < 0)
     rises = steps[steps > 0]
@@ -84,8 +84,7 @@ def without_wraps(clock: NDArray[Any]) -> tuple[NDArray[Any], str]:
             if inside and near.all() and (after + size - before <= 10 * usual).all():
                 turns = np.zeros(len(clock), dtype=np.int64)
                 turns[falls + 1] = 1
-                whole = clock.dtype.kind == "f"
-                made = clock if whole else clock.astype(np.int64)
+                made = clock if clock.dtype.kind == "f" else clock.astype(np.int64)
                 made = made + (np.cumsum(turns) * 2**bits).astype(made.dtype)
                 times = "once" if len(falls) == 1 else f"{len(falls)} times"
                 return (
