@@ -21,7 +21,6 @@ from offbeat.data.windows import windows
 from offbeat.errors import MissingExtraError
 from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_model
-from offbeat.models.hub import trained_models
 from offbeat.models.zoo import make_model, train_config
 from offbeat.plots.animation import side_by_side
 from offbeat.plots.errors import by_elapsed
@@ -40,6 +39,8 @@ NEW_SEED = 2024
 
 _LONGEST = 10  # rows since the last observation, in the figure
 _PREFIX = f"{ROBOT}-{100 * OBSERVED_FRACTION:.0f}-"
+SHIPPED = (LARGE, f"{_PREFIX}ode_rnn", f"{_PREFIX}ode_gru_d")
+"""Trained models that are compared; `offbeat models` lists all."""
 
 COMPARED, SHOWN, FREE = "hopper_errors.png", "hopper.gif", "hopper_extrapolation.gif"
 WRITTEN: Mapping[str, str] = {
@@ -131,16 +132,11 @@ def compare_hopper(
     """
     recorded = simulate(ROBOT, n_new, 2 * ROWS, seed=NEW_SEED, progress=progress)
     new = mask_out(windows(recorded, ROWS, seed=NEW_SEED), OBSERVED_FRACTION, seed=NEW_SEED)
-    shipped = [
-        name
-        for name in (each.partition("/")[2] for each in trained_models())
-        if name == LARGE or name.startswith(_PREFIX)
-    ]
-    models: dict[str, BaseModel] = {name: load_model(f"offbeat/{name}") for name in shipped}
+    models: dict[str, BaseModel] = {name: load_model(f"offbeat/{name}") for name in SHIPPED}
     seconds = sum(epoch.seconds for epoch in fitted.history)
     here = f"{LIVE}, trained here"
     models[here] = trained
-    notes = {name: f"offbeat/{name}, comes with the package" for name in shipped}
+    notes = {name: f"offbeat/{name}, comes with the package" for name in SHIPPED}
     notes[here] = f"{fitted.steps} steps in {seconds:.0f} s"
     notes[LAST_VALUE] = "nothing to train"
     unit = models[f"{_PREFIX}ode_rnn"].scaler
