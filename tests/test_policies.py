@@ -188,6 +188,35 @@ def test_several_robots_together_are_each_alone(name):
         assert np.allclose(policy.act(t, v, m), [one[row] for one in alone], atol=1e-11)
 
 
+@pytest.mark.parametrize("name", MODELS)
+def test_a_robot_whose_frames_are_late_changes_no_action_of_another(name):
+    policy = small(name)
+    with torch.no_grad():  # a decay that acts over a gap of any length
+        for part, value in policy.model.named_parameters():
+            if part == "decay.bias":
+                value.fill_(0.5)
+    times, values, masks = episode()
+    expected = acted(policy, times, values, masks)
+    policy.reset(2)
+    for row, time in enumerate(times):
+        now = np.array([time, time + 0.01])
+        both = [np.stack([part[row]] * 2) for part in (values, masks)]
+        chosen = policy.act(np.full(2, time), *both, now=now)
+        assert np.allclose(chosen[0], expected[row], atol=1e-11)
+
+
+@pytest.mark.parametrize("rows", [5, 500])
+def test_the_time_since_actions_that_are_never_seen_is_that_since_the_last_observed_row(rows):
+    model = small("gru_d").model
+    times = 0.05 * np.arange(rows)
+    observed = np.zeros((rows, 3), dtype=bool)
+    observed[:-2, :2] = True
+    values = np.zeros((rows, 3))
+    shown = ob.Trajectory(times, values, observed=observed, names=NAMES, roles=ROLES)
+    delta = model.step_inputs(model.batch(ob.Dataset((shown,))))[0].delta[0] * model.time_unit
+    assert delta[1:].numpy() == pytest.approx(np.repeat([[0.05]] * (rows - 2) + [[0.1]], 3, axis=1))
+
+
 @pytest.mark.parametrize("name", ["gru_d", "anchored_trend"])
 def test_saved_and_loaded_a_policy_acts_the_same_bit_for_bit(name, tmp_path):
     policy = small(name)

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from offbeat.data.batch import Batch, last_index
+from offbeat.data.trajectory import ACTION
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +177,16 @@ class _Rows:
 
     @cached_property
     def channel_clock(self) -> Tensor:
-        """(batch, rows, channels) the same, or the start of the clock."""
-        return torch.maximum(self.channel_at, self.start[:, None, None])
+        """(batch, rows, channels) the same, or the start of the clock.
+
+        Of an action that was never observed, as in a policy, it is the time of the last observed
+        row: the time since the start would leave the range of training in a longer episode.
+        """
+        clock = torch.maximum(self.channel_at, self.start[:, None, None])
+        if ACTION not in self.batch.roles:
+            return clock
+        acts = torch.tensor([role == ACTION for role in self.batch.roles], device=clock.device)
+        return torch.where(acts & self.channel_at.isneginf(), self.clock[..., None], clock)
 
     @cached_property
     def last(self) -> Tensor:

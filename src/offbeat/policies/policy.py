@@ -134,8 +134,10 @@ class Policy:
         chosen, past = self._forward(stamp, values, seen)
         if arrived.any():  # a row in which nothing is observed leaves no trace
             self._past = _chosen(arrived, past, self._past)
-        if (asked > stamp).any():
-            chosen, _ = self._forward(asked, np.zeros_like(values), np.zeros_like(seen))
+        later = asked > stamp
+        if later.any():
+            then, _ = self._forward(asked, np.zeros_like(values), np.zeros_like(seen))
+            chosen = np.where(later[:, None], then, chosen)
         self._newest = np.where(arrived, stamp, self._newest)
         self._asked, self._sent = asked, sent
         return chosen if self.n is not None else chosen[0]
