@@ -392,6 +392,46 @@ class TestAFolder:
         assert np.isnan(trajectory.values[1::2, 0]).all()
         assert len(read(folder, files="episodes")) == 2
 
+    def test_of_sensors_of_one_time_is_merged_although_they_share_channels(self, tmp_path):
+        # As of a phone: x, y and z of each sensor, on a clock since 1970.
+        start = 1_741_767_242_000_000_000
+        stamps = start + (1e9 * tables.TIMES).astype(np.int64)
+        axes = [{"time": stamps + i, **tables.XY} for i in range(2)]
+        folder = self.write(tmp_path, ["Gyroscope", "Accelerometer"], axes)
+        (trajectory,) = dataset = read(folder)
+        assert dataset.names == ("Accelerometer.x", "Accelerometer.y", "Gyroscope.x", "Gyroscope.y")
+        assert trajectory.values[::2, 2] == pytest.approx(tables.X)
+        assert trajectory.values[1::2, 0] == pytest.approx(tables.X + 1)
+
+    @pytest.mark.parametrize(
+        ("names", "shift"),
+        [
+            (["robot_1", "robot_2"], 0),  # names that a number tells from each other
+            (["left", "right"], 3600 * 10**9),  # one after the other
+            (["left", "right"], -1_741_767_242 * 10**9),  # each counts from its own start
+        ],
+    )
+    def test_of_one_kind_of_file_is_read_as_episodes(self, tmp_path, names, shift):
+        start = 1_741_767_242_000_000_000 + min(shift, 0)
+        stamps = start + (1e9 * tables.TIMES).astype(np.int64)
+        columns = [{"time": stamps + i * max(shift, 0), **tables.XY} for i in range(2)]
+        assert len(read(self.write(tmp_path, names, columns))) == 2
+
+    def test_leaves_out_tables_without_rows_or_times_and_says_so(self, tmp_path):
+        columns = [{"time": tables.TIMES, **tables.XY}] * 2
+        folder = self.write(tmp_path, ["a1", "a2"], columns)
+        (folder / "Annotation.csv").write_text("time,text\n")
+        (folder / "Metadata.csv").write_text("version,device\n3,phone\n")
+        dataset = read(folder)
+        assert dataset.meta["labels"] == ["a1", "a2"]
+        assert "left out: Annotation.csv, Metadata.csv" in notes(dataset)
+        with pytest.raises(FileFormatError, match="a header and no rows"):  # asked for by name
+            read([folder / "a1.csv", folder / "Annotation.csv"])
+        (tmp_path / "b").mkdir()
+        (tmp_path / "b" / "a.csv").write_text("version,device\n3,phone\n")
+        with pytest.raises(FileFormatError, match="no column of times"):
+            read(tmp_path / "b")
+
     def test_of_several_formats_asks_for_one(self, tmp_path):
         columns = {"time": tables.TIMES, **tables.XY}
         tables.write_csv(tmp_path / "a", columns)

@@ -69,6 +69,16 @@ def test_a_clock_in_any_unit_is_found_by_its_name_and_its_values():
     )
     assert found.counters == ("stamp", "time_ms")
     assert find_redundant(dataset(x=WAVE, time_to_goal=9 - TIMES)).names == ()
+    assert find_redundant(dataset(x=WAVE, seconds_elapsed=TIMES)).counters == ("seconds_elapsed",)
+
+
+def test_a_clock_is_found_although_an_episode_has_a_single_value_of_it():
+    whole = dataset(x=WAVE, time_ms=1e3 * TIMES)
+    late = np.column_stack((WAVE[:4], [NAN, NAN, NAN, 12.0]))
+    one = ob.Trajectory(TIMES[:4], late, names=whole.names)
+    assert find_redundant(ob.Dataset((*whole, one))).counters == ("time_ms",)
+    two = ob.Trajectory(TIMES[:2], [[0.1, 3.2], [0.7, 9.1]], names=whole.names)
+    assert find_redundant(ob.Dataset((two,) * 30)).counters == (), "two are always on a line"
 
 
 def test_a_copy_is_found_also_where_it_was_logged_a_little_later():

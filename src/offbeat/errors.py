@@ -49,6 +49,10 @@ class FileFormatError(OffbeatError, ValueError):
     """A file is truncated, damaged, or not of the expected format."""
 
 
+class NoLogError(FileFormatError):
+    """A table has no rows, or no times: it may be about a log, and is none."""
+
+
 class MissingExtraError(OffbeatError, ImportError):
     """An optional dependency is not installed; the message names the extra that installs it."""
 

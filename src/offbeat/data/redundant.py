@@ -16,7 +16,7 @@ from offbeat.errors import InputError, listed
 _FEWEST = 20  # values of a counter or a copy
 _FEW = 3  # distinct values of a copy, fewer than which two switches may agree by chance
 _COUNTS = 0.8  # fraction of a counter's steps that are its usual one
-_CLOCK = re.compile(r"time|stamp|clock|secs?$|nanos", re.IGNORECASE)
+_CLOCK = re.compile(r"time|stamp|clock|secs?$|nanos|elapsed", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -159,15 +159,19 @@ def _counts(known: list[NDArray[np.float64]]) -> bool:
 
 def _tells_time(dataset: Dataset, c: int) -> bool:
     """Whether the values are the time of their rows, in some unit, up to half a typical step."""
+    compared = 0
     for t in dataset:
         known = ~np.isnan(t.values[:, c])
         times, values = t.times[known], t.values[known, c]
-        if len(times) < _FEWEST or values[-1] <= values[0]:
+        if len(times) < 3:  # two are on a line whatever they measure
+            continue
+        compared += len(times)
+        if values[-1] <= values[0]:
             return False
         scaled = (values - values[0]) * ((times[-1] - times[0]) / (values[-1] - values[0]))
         if np.abs(scaled - (times - times[0])).max() > 0.5 * float(np.median(np.diff(times))):
             return False
-    return True
+    return compared >= _FEWEST
 
 
 def _same_times(dataset: Dataset, one: int, other: int) -> bool:

@@ -155,8 +155,8 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
     left = cleaning["left_out"]
     if left["episodes"]:
         lines.append(
-            f"{left['episodes']} episodes of fewer than {left['min_rows']} rows were left out "
-            f"({_rows(left['rows'])})"
+            f"{_episodes(left['episodes'])} of fewer than {left['min_rows']} rows "
+            f"{_were(left['episodes'])} left out ({_rows(left['rows'])})"
         )
     if left["without_rows"]:
         what = "1 recording" if left["without_rows"] == 1 else f"{left['without_rows']} recordings"
@@ -207,6 +207,10 @@ def sentences(cleaning: Mapping[str, Any]) -> list[str]:
     if cleaning["resample_hz"] is not None:
         lines.append(f"resampled at {cleaning['resample_hz']:g} Hz")
     return lines
+
+
+def _episodes(count: int) -> str:
+    return "1 episode" if count == 1 else f"{count} episodes"
 
 
 def _rows(count: int) -> str:

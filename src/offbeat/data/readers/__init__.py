@@ -21,7 +21,15 @@ from offbeat.data.readers.options import check_types
 from offbeat.data.recording import ReaderOptions, Recording, assemble
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
-from offbeat.errors import FileFormatError, InputError, OffbeatError, one_of, printable
+from offbeat.errors import (
+    FileFormatError,
+    InputError,
+    NoLogError,
+    OffbeatError,
+    listed,
+    one_of,
+    printable,
+)
 from offbeat.registry import Registry
 
 PACKED = {
@@ -138,7 +146,8 @@ def read(
         format: name of the reader; by default found by the file's suffix and content.
         files: of several files, each holds one or several `episodes`; or a sensor of one recording,
             and they are merged (`merge`) by their times. `auto` merges files no two of which have a
-            channel in common.
+            channel in common, and files with names of their own that were logged at the same time.
+            A table in a folder without rows, or without times, is left out, which is noted.
         **options: options of the format, such as `time_unit` of CSV, and the fields of
             `ReaderOptions`, for every format but Offbeat's own.
 
@@ -153,13 +162,13 @@ def read(
     """
     one_of("files", files, FILES)
     if not isinstance(path, str | Path):
-        listed = [require_source(one) for one in check_paths(path)]
-        return _read_several(listed, listed[0].parent, format, files, options)
+        stated = [require_source(one) for one in check_paths(path)]
+        return _read_several(stated, stated[0].parent, format, files, options)
     path = require_source(path)
     if path.is_dir():
         inside = _files_of(path, format)
         if inside:
-            return _read_several(inside, path, format, files, options)
+            return _read_several(inside, path, format, files, options, stated=False)
     reader = reader_of(path) if format is None else READERS[format]
     own, cleaning = _split(options, reader)
     made = _made(reader, path, own)
@@ -174,9 +183,15 @@ def read(
 
 
 def _read_several(
-    paths: list[Path], folder: Path, format: str | None, files: str, options: dict[str, Any]
+    paths: list[Path],
+    folder: Path,
+    format: str | None,
+    files: str,
+    options: dict[str, Any],
+    *,
+    stated: bool = True,
 ) -> Dataset:
-    """Several files as one data set."""
+    """Several files as one data set; all of them, if they were stated."""
     readers = {path: reader_of(path) if format is None else READERS[format] for path in paths}
     names = sorted({reader.name for reader in readers.values()})
     if len(names) > 1:
@@ -186,15 +201,30 @@ def _read_several(
     reader = readers[paths[0]]
     own, cleaning = _split(options, reader)
     read_files: list[tuple[Path, list[Recording]]] = []
+    refused: list[NoLogError] = []
     for path in paths:
-        made = _made(reader, path, own)
+        try:
+            made = _made(reader, path, own)
+        except NoLogError as error:
+            if stated:
+                raise
+            refused.append(error)
+            continue
         if isinstance(made, Dataset):
             raise FileFormatError(
                 f"{path} is a finished data set, which is read alone; load each, and make one "
                 "Dataset of their trajectories"
             )
         read_files.append((path, made))
-    return _assembled(together(read_files, files, folder.name), folder, reader, cleaning)
+    if not read_files:
+        raise refused[0]
+    recordings = together(read_files, files, folder.name)
+    if refused:
+        read_paths = {path for path, _ in read_files}
+        left = listed([path.name for path in paths if path not in read_paths], 6)
+        note = f"files without rows or times are left out: {left}"
+        recordings[0] = replace(recordings[0], notes=(*recordings[0].notes, note))
+    return _assembled(recordings, folder, reader, cleaning)
 
 
 def _files_of(folder: Path, format: str | None) -> list[Path]:

@@ -26,7 +26,7 @@ from offbeat.data.cleaning.clocks import (
 from offbeat.data.cleaning.options import is_number
 from offbeat.data.readers.options import names as names_of
 from offbeat.data.readers.stamps import form_of
-from offbeat.errors import FileFormatError, InputError, listed, one_of
+from offbeat.errors import FileFormatError, InputError, NoLogError, listed, one_of
 
 LABEL_NAMES = (
     *("trajectory", "episode", "episode_index", "demo", "trajectory_id", "episode_id", "demo_id"),
@@ -355,7 +355,7 @@ def stamp_columns(
             f"{path} has several stamps, each in two columns: {shown}; say which one is the time "
             "with time_column="
         )
-    raise FileFormatError(
+    raise NoLogError(
         f"{path} has no {what} of times: one must be called {', '.join(TIME_NAMES[:3])}, ... got "
         f"{listed(names, 12, quoted=True)}; say which one with time_column=, or give rate_hz="
     )

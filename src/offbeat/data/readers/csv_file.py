@@ -30,7 +30,7 @@ from offbeat.data.readers.csv_streams import Spaced, Without, with_count, with_d
 from offbeat.data.readers.gathered import Coded, Gathered
 from offbeat.data.readers.stamps import expected_after, form_of, over_midnight, with_stamps
 from offbeat.data.readers.text import DAMAGE, TextFile, no_text
-from offbeat.errors import FileFormatError, InputError, listed
+from offbeat.errors import FileFormatError, InputError, NoLogError, listed
 
 _COMMA = re.compile(r"[+-]?\d+,\d+")
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
@@ -189,7 +189,7 @@ class CsvFile:
 
         lines = self._count_lines()
         if not lines:
-            raise FileFormatError(f"{self.path} has a header and no rows, expected one per time")
+            raise NoLogError(f"{self.path} has a header and no rows, expected one per time")
         require_rows(self.path, lines, len(columns.channels))
         clocks = self._clock_types(sample, columns, unit)
         form = sample.form_of(columns.time) if columns.time and columns.rest is None else None
@@ -249,9 +249,7 @@ class CsvFile:
             self._check_odd(header, columns)
             self._note_short_end(header, sample)
             if not len(table.clock):
-                raise FileFormatError(
-                    f"{self.path} has a header and no rows, expected one per time"
-                )
+                raise NoLogError(f"{self.path} has a header and no rows, expected one per time")
             columns, table = self._usable(header, sample, columns, table, converter)
             if form == "of day":
                 table = _replaced(table, over_midnight(table.clock))

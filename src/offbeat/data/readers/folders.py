@@ -18,6 +18,10 @@ _MOST_FILES = 100_000
 _ABOUT = re.compile(r"(readme|licen[cs]e|changelog|citation|copying)\b", re.IGNORECASE)
 """Names of files about a data set, which are not read with its folder."""
 
+_NUMBER = re.compile(r"\d+")
+_SINCE_1970 = 10 * 365 * 86_400 * 10**9
+"""ns; stamps beyond it count from 1970 or before, and not from the start of a recording."""
+
 
 def files_in(folder: Path, suffixes: Iterable[str]) -> list[Path]:
     """The files in a folder with one of these suffixes, `ep2` before `ep10`, without a README.
@@ -54,7 +58,7 @@ def together(
         read: each file with its recordings.
         files: `episodes`, each file holds one or several; `merge`, each file holds a sensor of
             one recording, on one clock; `auto`, the latter where no two files have a channel in
-            common.
+            common, or where they were logged at the same time.
         origin: where they are from, for messages.
 
     Raises:
@@ -67,7 +71,8 @@ def together(
     ]
     distinct = sum(map(len, channels)) == len(set().union(*channels))
     if files == "auto":
-        files = "merge" if distinct and len(read) > 1 else "episodes"
+        sensors = distinct or _at_once(read)
+        files = "merge" if sensors and len(read) > 1 else "episodes"
     if files == "merge":
         return [_merged(read, origin)]
     several = f"{len(read)} files are read as episodes (files=merge merges them by their times)"
@@ -78,6 +83,24 @@ def together(
             label = f"{path.stem}/{recording.label}" if recording.label else path.stem
             made.append(replace(recording, label=label, notes=(*told, *recording.notes)))
     return made
+
+
+def _at_once(read: Sequence[tuple[Path, list[Recording]]]) -> bool:
+    """Whether files are of one time, as the sensors of a phone are, each with axes x, y and z.
+
+    Their stamps count from 1970 or before, have a time in common, and their names differ by more
+    than a number, as those of episodes or of robots do not.
+    """
+    if len({_NUMBER.sub("", path.stem) for path, _ in read}) < len(read):
+        return False
+    starts, ends = [], []
+    for _, recordings in read:
+        stamps = [s.stamps for recording in recordings for s in recording.signals if len(s.stamps)]
+        if len(recordings) != 1 or recordings[0].clock_zero or not stamps:
+            return False
+        starts.append(min(int(s.min()) for s in stamps))
+        ends.append(max(int(s.max()) for s in stamps))
+    return min(starts) > _SINCE_1970 and max(starts) < min(ends)
 
 
 def _merged(read: Sequence[tuple[Path, list[Recording]]], origin: str) -> Recording:

@@ -28,7 +28,7 @@ from offbeat.data.readers.stamps import EXAMPLE, form_of
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS
 from offbeat.data.source import require_file
-from offbeat.errors import FileFormatError
+from offbeat.errors import FileFormatError, NoLogError
 
 _ROWS = 1 << 16  # in memory at a time, besides the result
 _BUFFER = 1 << 18  # bytes of a column as it is stored, in memory at a time
@@ -119,7 +119,7 @@ def read_parquet(
             columns = Columns.of(path, _names(schema, options.time_column), options, sample)
             _check_types(path, schema, columns)
             if not file.metadata.num_rows:
-                raise FileFormatError(f"{path} has columns and no rows, expected one per time")
+                raise NoLogError(f"{path} has columns and no rows, expected one per time")
             rows = file.metadata.num_rows
             widths = {
                 name: _width(path, name, chunks(name))
