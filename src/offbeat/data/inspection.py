@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from offbeat.data.arrays import hand_over
 from offbeat.data.cleaning.channels import find_repeats, new_values
 from offbeat.data.cleaning.log import sentences
+from offbeat.data.gaps import fastest_step_of, usual_gap
 from offbeat.data.outliers import Outliers, find_outliers
 from offbeat.data.redundant import find_redundant
 from offbeat.data.trajectory import Dataset
@@ -103,7 +104,8 @@ class Inspection:
         time_unit: unit of times in the file.
         rows: of all episodes together.
         known: fraction of the values that are known.
-        rate_hz: one over the median time between two rows; None where no episode has two.
+        rate_hz: one over the median time between two rows (see `usual_gap`); None where no episode
+            has two.
         channels: one entry each.
         episodes: one entry each.
         found: sentences on what was found and changed while reading.
@@ -158,7 +160,7 @@ def inspect(dataset: Dataset) -> Inspection:
         time_unit=str(dataset.meta.get("time_unit", "s")),
         rows=rows,
         known=known / (rows * dataset.channels),
-        rate_hz=_rate(steps),
+        rate_hz=_rate(steps, fastest_step_of(dataset)),
         channels=channels,
         episodes=_episodes(dataset, cleaning),
         found=tuple(sentences(cleaning)) if cleaning else (),
@@ -252,8 +254,8 @@ def _longest(
     return longest[episode], (episode, float(dataset[episode].times[row]))
 
 
-def _rate(steps: NDArray[np.float64]) -> float | None:
-    return 1 / float(np.median(steps)) if len(steps) else None
+def _rate(steps: NDArray[np.float64], fastest: float = 0.0) -> float | None:
+    return 1 / usual_gap(float(np.median(steps)), fastest) if len(steps) else None
 
 
 def _jitter(steps: NDArray[np.float64]) -> float | None:

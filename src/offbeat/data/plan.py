@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from offbeat.config import SplitConfig
 from offbeat.data.cleaning.channels import find_repeats
+from offbeat.data.gaps import usual_gap
 from offbeat.data.inspection import without_repeats
 from offbeat.data.outliers import mask_outliers
 from offbeat.data.redundant import Redundant, find_redundant, leave_out
@@ -300,7 +301,7 @@ class _Times:
         total: all episodes together.
         episode: the median one.
         rows: of all episodes together.
-        gap: between two rows.
+        gap: between two rows, see `usual_gap`.
         slowest: the largest median time between two values of a channel.
         silence: the longest usual time without a value.
         longest: the longest time without a value.
@@ -325,6 +326,7 @@ class _Times:
                 "longer log"
             )
         slowest = silence = longest = 0.0
+        fastest = np.inf
         done: set[bytes] = set()
         for c in states:
             masks = [t.observed[:, c] for t in dataset]
@@ -338,6 +340,7 @@ class _Times:
             if len(own):
                 usual = float(np.median(own))
                 slowest, longest = max(slowest, usual), max(longest, float(own.max()))
+                fastest = min(fastest, usual)
                 long = own[own > _SILENCE * usual]
                 if len(long):
                     silence = max(silence, float(np.quantile(long, 0.9)))
@@ -347,7 +350,7 @@ class _Times:
             sum(lasts),
             float(np.median(lasts)),
             rows,
-            float(np.median(steps)),
+            usual_gap(float(np.median(steps)), fastest if np.isfinite(fastest) else 0.0),
             slowest,
             silence,
             longest,

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.gaps import fastest_step_of, usual_gap
 from offbeat.data.scaler import moments
 from offbeat.data.schema import Schema
 from offbeat.data.store import load, save
@@ -98,7 +99,8 @@ class Moments:
         variance: (channels,) of them.
         low: (channels,) smallest of them; inf without one.
         high: (channels,) largest of them; -inf without one.
-        median_gap: s, between consecutive rows, of at most `MOST_GAPS` of them, evenly chosen.
+        median_gap: s, between consecutive rows, of at most `MOST_GAPS` of them, evenly chosen; see
+            `usual_gap`, with the median over files of the step of the fastest channel.
         longest_elapsed: s, longest time since the last observed row.
         longest_delta: s, longest time since observation of any channel.
     """
@@ -275,10 +277,12 @@ class ShardedDataset:
         """Measured in one pass over all files; kept."""
         total: list[NDArray[Any]] | None = None
         gaps: list[NDArray[np.float64]] = []
+        fastest: list[float] = []
         stride = max(1, self.rows // MOST_GAPS)
         longest = np.zeros(2)
         for part in self.parts():
             total = _merged(total, list(moments(part)))
+            fastest.append(fastest_step_of(part))
             for t in part:
                 gaps.append(np.diff(t.times)[::stride])
                 longest = np.maximum(longest, _silences(t))
@@ -288,7 +292,7 @@ class ShardedDataset:
             raise InputError(
                 "every trajectory has a single row; a model needs at least one of two rows"
             )
-        median = float(np.median(every))
+        median = usual_gap(float(np.median(every)), float(np.median(fastest)))
         elapsed = max(float(longest[0]), median)
         count, mean, variance, low, high = total
         delta = max(float(longest[1]), elapsed)

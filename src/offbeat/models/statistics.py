@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from offbeat.data.batch import Batch, last_index
+from offbeat.data.gaps import fastest_step, usual_gap
 from offbeat.data.scaler import Scaler, clipped
 from offbeat.data.shards import Moments
 from offbeat.data.trajectory import EXOGENOUS
@@ -23,7 +24,8 @@ class Statistics:
     Attributes:
         mean: per channel, over observed values: the empirical mean of equation 27.
         std: per channel, over observed values; 1 for a constant channel.
-        median_gap: s, between consecutive rows.
+        median_gap: s, between consecutive rows, or between observations of the fastest channel
+            where sensors report almost at once (see `usual_gap`).
         longest_elapsed: s, longest time since the last observed row.
         longest_delta: s, longest time since observation of any channel (equation 25).
         rows: of the longest training trajectory; 0 in checkpoints of 0.1.
@@ -86,6 +88,7 @@ class Statistics:
                 "every training trajectory has a single row; a model needs at least one "
                 "trajectory of two rows"
             )
+        gap = usual_gap(float(gaps.median()), _fastest(batch, mask))
         low = torch.where(mask, values, torch.inf).amin(dim=(0, 1))
         high = torch.where(mask, values, -torch.inf).amax(dim=(0, 1))
         never = low > high  # exogenous ones without a value
@@ -93,9 +96,9 @@ class Statistics:
         return cls(
             tuple(mean.tolist()),
             tuple(std.tolist()),
-            float(gaps.median()),
-            max(longest[0], float(gaps.median())),
-            max(*longest, float(gaps.median())),
+            gap,
+            max(longest[0], gap),
+            max(*longest, gap),
             batch.rows,
             tuple(torch.where(never, 0.0, low).tolist()),
             tuple(torch.where(never, 0.0, high).tolist()),
@@ -144,6 +147,15 @@ class Statistics:
             (*each, 1.0) if len(each) == 4 else tuple(each) for each in fields.get("filters", ())
         )
         return cls(**fields)
+
+
+def _fastest(batch: Batch, mask: torch.Tensor) -> float:
+    """Smallest median time between two observations of a channel, in s."""
+    valid = batch.valid
+    of = torch.arange(len(batch), device=valid.device)[:, None].expand(valid.shape)
+    return fastest_step(
+        batch.times[valid].cpu().numpy(), of[valid].cpu().numpy(), mask[valid].cpu().numpy()
+    )
 
 
 def _longest(batch: Batch, mask: torch.Tensor) -> float:
