@@ -2,13 +2,39 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from scipy import stats
 
 import offbeat as ob
 from examples import irregular_walker
+from examples.policies import paired
 from examples.policies.measures import distances, swept_error_area
 from examples.policies.shapes import RETURNS_S, cloned, pushed
+
+
+def test_trainings_of_one_seed_are_pairs_and_each_counts_once(tmp_path):
+    def write(name, **record):
+        (tmp_path / f"{name}.json").write_text(json.dumps(record))
+
+    write("expert", returns={"0 %": [200.0] * 8})
+    write("random", returns={"0 %": [0.0] * 8})
+    returns = {"anchored": [220, 222, 224], "ODE-RNN": [200, 200, 206], "GRU-D": [260]}
+    for rival, each in returns.items():
+        for seed, value in enumerate(each):
+            record = {"rival": rival, "training": "drops", "seed": seed}
+            write(f"{rival}-{seed}", **record, returns={"70 %": [float(value)] * 8})
+    alone, three = sorted(paired.differences(tmp_path, "drops", "70 %"), key=lambda d: d.pairs)
+    assert (alone.rival, alone.pairs, alone.ahead, alone.test) == ("GRU-D", 1, 0, None)
+    assert alone.interval == (alone.difference,) * 2 == (-20.0, -20.0)
+    assert (three.rival, three.pairs, three.ahead) == ("ODE-RNN", 3, 3)
+    expected = stats.ttest_rel([110, 111, 112], [100, 100, 103])
+    assert three.test.paired_t.p == pytest.approx(expected.pvalue)
+    assert three.difference == pytest.approx(111 - stats.trim_mean([100] * 16 + [103] * 8, 0.25))
+    assert 9 <= three.interval[0] < three.difference < three.interval[1] <= 11.5
+
 
 TURN = np.linspace(0, 2 * np.pi, 2001)[:, None]
 CIRCLE = np.concatenate([np.cos(TURN), np.sin(TURN)], axis=1)

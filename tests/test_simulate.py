@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 from offbeat.data import simulate as module
-from offbeat.data.robots import ROBOTS, channels_of, load_model, register_robot
+from offbeat.data.robots import (
+    ROBOTS,
+    channels_of,
+    gymnasium_env,
+    load_model,
+    register_robot,
+)
 from offbeat.data.simulate import available_cores, simulate
 from offbeat.errors import DivergenceError, FileFormatError, InputError, MissingExtraError
 
@@ -337,6 +343,15 @@ def test_robots_of_gymnasium_start_as_their_environments_do():
         quiet("CartPole-v1", 1)
     with pytest.raises(InputError, match="Gymnasium has no environment 'Hoper-v5'"):
         quiet("Hoper-v5", 1)
+
+
+def test_the_deprecated_mass_of_gymnasiums_cheetah_is_not_warned_of(tmp_path, capfd, monkeypatch):
+    pytest.importorskip("gymnasium")
+    monkeypatch.chdir(tmp_path)
+    env = gymnasium_env("HalfCheetah-v5")
+    assert env.unwrapped.model.body_mass.sum() == pytest.approx(14)  # what it deprecates is done
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
 
 
 def test_hopper_channels_are_named_after_the_joints_of_the_model():

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import trim_mean
 
+from . import paired
 from .rivals import RIVALS
+from .scores import interquartile, percent, read, records
 
 TITLES = {
     "drops": "Trained with frames lost",
     "all drops": "Trained with frames, sensors and bursts lost",
     "no drops": "Trained without losses",
 }
-RESAMPLED = 2000
-
-
-def interquartile(scores: NDArray[np.float64], seed: int = 0) -> tuple[float, float, float]:
-    """Interquartile mean and its 95 % interval, as Agarwal et al. 2021 (arXiv:2108.13264).
-
-    Trainings are drawn anew for each episode, which is a stratum: all trainings meet the same ones.
-
-    Args:
-        scores: (trainings, episodes).
-        seed: of the bootstrap.
-    """
-    random = np.random.default_rng(seed)
-    drawn = random.integers(0, len(scores), (RESAMPLED, *scores.shape))
-    means = trim_mean(
-        scores[drawn, np.arange(scores.shape[1])].reshape(RESAMPLED, -1), 0.25, axis=1
-    )
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(trim_mean(scores.ravel(), 0.25)), float(low), float(high)
 
 
 def table(folder: Path, training: str) -> str:
@@ -45,34 +25,30 @@ def table(folder: Path, training: str) -> str:
         folder: of the results.
         training: one of `TITLES`.
     """
-    expert, random = (_read(folder / f"{name}.json")["returns"] for name in ("expert", "random"))
+    expert = read(folder / "expert.json")["returns"]
     names = list(expert)
-    zero, one = np.mean(random[names[0]]), np.mean(expert[names[0]])
     lines = [
         f"| {TITLES[training].lower()} | " + " | ".join(names) + " | trainings | s |",
         "|---" * (len(names) + 3) + "|",
-        _line("expert, last value", {k: np.array([v]) for k, v in expert.items()}, zero, one),
+        _line(folder, "expert, last value", {k: [v] for k, v in expert.items()}),
     ]
     lines[-1] += " | | |"
+    every = records(folder)
     for rival in RIVALS:
-        found = [
-            r
-            for path in sorted(folder.glob("*-*.json"))
-            if (r := _read(path))["rival"] == rival and r["training"] == training
-        ]
+        found = [r for r in every if (r["rival"], r["training"]) == (rival, training)]
         if not found:
             lines.append(f"| {rival} |" + " not run |" * (len(names) + 2))
             continue
-        scores = {k: np.array([r["returns"][k] for r in found]) for k in names}
+        returns = {k: [r["returns"][k] for r in found] for k in names}
         seconds = np.mean([r["training_seconds"] for r in found])
-        lines.append(f"{_line(rival, scores, zero, one)} | {len(found)} | {seconds:.0f} |")
+        lines.append(f"{_line(folder, rival, returns)} | {len(found)} | {seconds:.0f} |")
     return "\n".join(lines)
 
 
-def _line(name: str, returns: dict[str, Any], zero: float, one: float) -> str:
+def _line(folder: Path, name: str, returns: dict[str, Any]) -> str:
     entries = []
     for each in returns.values():
-        mean, low, high = interquartile(_percent(each, zero, one))
+        mean, low, high = interquartile(percent(folder, each))
         entries.append(f"{mean:.0f}" if len(each) == 1 else f"{mean:.0f} ({low:.0f}–{high:.0f})")
     return f"| {name} | " + " | ".join(entries)
 
@@ -89,23 +65,22 @@ def draw(folder: Path, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    expert, random = (_read(folder / f"{name}.json")["returns"] for name in ("expert", "random"))
+    expert = read(folder / "expert.json")["returns"]
     fractions = [name for name in expert if name.endswith("%")]
     lost = [float(name.split()[0]) for name in fractions]
-    zero, one = np.mean(random[fractions[0]]), np.mean(expert[fractions[0]])
-    records = [_read(each) for each in sorted(folder.glob("*-*.json"))]
-    trainings = [t for t in TITLES if any(r["training"] == t for r in records)]
+    every = records(folder)
+    trainings = [t for t in TITLES if any(r["training"] == t for r in every)]
     size = (4.4 * len(trainings) + 2.2, 3.8)
     figure, axes = plt.subplots(1, len(trainings), figsize=size, sharey=True, squeeze=False)
     for axis, training in zip(axes[0], trainings, strict=True):
-        held = [interquartile(_percent([expert[name]], zero, one))[0] for name in fractions]
+        held = [interquartile(percent(folder, [expert[name]]))[0] for name in fractions]
         axis.plot(lost, held, color="black", ls="--", label="expert, last value")
         for i, rival in enumerate(RIVALS):
-            some = [r for r in records if (r["rival"], r["training"]) == (rival, training)]
+            some = [r for r in every if (r["rival"], r["training"]) == (rival, training)]
             if not some:
                 continue
             each = [
-                interquartile(_percent([r["returns"][name] for r in some], zero, one))
+                interquartile(percent(folder, [r["returns"][name] for r in some]))
                 for name in fractions
             ]
             mean, low, high = np.array(each).T
@@ -123,11 +98,6 @@ def draw(folder: Path, path: Path) -> None:
     plt.close(figure)
 
 
-def _percent(returns: Any, zero: float, one: float) -> NDArray[np.float64]:
-    """100 for the expert that sees everything, 0 for random actions."""
-    return 100 * (np.asarray(returns) - zero) / (one - zero)
-
-
 def write(document: Path, folder: Path, robot: str) -> None:
     """Replaces the tables of a robot in a document, between its marks, and draws its figure.
 
@@ -136,8 +106,10 @@ def write(document: Path, folder: Path, robot: str) -> None:
         folder: of the results.
         robot: name of the marks.
     """
-    run = {_read(path)["training"] for path in folder.glob("*-*.json")}
+    run = {record["training"] for record in records(folder)}
     tables = [table(folder, training) for training in TITLES if training in run]
+    with_losses = next(training for training in TITLES if training in run)
+    tables.append(paired.table(folder, with_losses, "70 %"))
     text = document.read_text(encoding="utf-8")
     before, rest = text.split(f"<!-- {robot} -->")
     _, after = rest.split(f"<!-- end of {robot} -->")
@@ -146,8 +118,3 @@ def write(document: Path, folder: Path, robot: str) -> None:
     document.write_text(
         f"{before}<!-- {robot} -->\n\n{inside}\n\n<!-- end of {robot} -->{after}", encoding="utf-8"
     )
-
-
-def _read(path: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return record

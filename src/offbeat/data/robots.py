@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -222,7 +223,8 @@ def gymnasium_env(name: str) -> Any:
     """
     gymnasium = require("gymnasium", "robots")
     try:
-        return gymnasium.make(name)
+        with _warnings_of_gymnasium(name):
+            return gymnasium.make(name)
     except gymnasium.error.DependencyNotInstalled as error:
         raise MissingExtraError(
             f"the environment {name!r} needs a package that is not installed "
@@ -233,6 +235,23 @@ def gymnasium_env(name: str) -> Any:
         raise InputError(
             f"Gymnasium has no environment {name!r} ({what}); give a name such as Hopper-v5"
         ) from None
+
+
+@contextmanager
+def _warnings_of_gymnasium(name: str) -> Iterator[None]:
+    """Logs MuJoCo's warnings while an environment is made.
+
+    The model of HalfCheetah sets its mass by `settotalmass`, which MuJoCo still does, and warns of
+    each time: that is for Gymnasium to change, so it is left out.
+    """
+    if not find_spec("mujoco"):
+        yield
+        return
+    with collected_warnings(require("mujoco", "sim")) as warnings:
+        yield
+    for warning in warnings:
+        if "settotalmass" not in warning:
+            logging.getLogger("offbeat").warning("%s: %s", name, warning)
 
 
 def gymnasium_robot(name: str) -> Robot:
