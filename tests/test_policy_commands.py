@@ -50,6 +50,26 @@ def test_a_log_becomes_a_policy_that_acts_in_an_environment(log, tmp_path, capsy
     assert 0.1 < said["observed"] < 0.7
 
 
+def test_an_environment_that_is_not_that_of_the_demonstrations_is_said(
+    log, tmp_path, capsys, caplog
+):
+    pytest.importorskip("gymnasium")
+    out = tmp_path / "policy"
+    slow = ["--actions=[torque]", "--reader.time_unit=min", *CLONE]  # rows 60 times as far apart
+    assert main(["clone", str(log), str(out), *slow]) == 0
+    capsys.readouterr()
+    assert main(["rollout", str(out), "Hopper-v5"]) == 2
+    error = "Hopper-v5 has 11 observations, the policy has 3 (cosine, sine, speed); give the"
+    assert error in capsys.readouterr().err
+    assert main(["rollout", str(out), "MountainCarContinuous-v0"]) == 2
+    error = "MountainCarContinuous-v0 does not say how long a step is; give dt"
+    assert error in capsys.readouterr().err
+    assert main(["rollout", str(out), "MountainCarContinuous-v0", "--dt=0.02"]) == 2
+    assert "MountainCarContinuous-v0 has 2 observations" in capsys.readouterr().err
+    assert main(["rollout", str(out), "Pendulum-v1", "--episodes=1", "--steps=2"]) == 0
+    assert "a step of Pendulum-v1 is 0.05 s, and the rows of" in caplog.text
+
+
 def test_at_least_one_demonstration_is_trained_on(log, tmp_path, capsys):
     arguments = ["--actions=[torque]", "--validation=0.99", *CLONE]
     assert main(["clone", str(log), str(tmp_path / "policy"), *arguments]) == 0
@@ -59,7 +79,7 @@ def test_at_least_one_demonstration_is_trained_on(log, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "demonstrations need observations and actions"),
+        ([], "does not say which of its channels are actions; name them, such as --actions"),
         (["--actions=[speed_limit]"], "unknown channel 'speed_limit'"),
         (["--actions=[torque]", "--low=[-2]"], "give both, or neither"),
         (["--actions=[torque]", "--loss=mae"], "unknown loss of actions 'mae'"),

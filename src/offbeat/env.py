@@ -227,7 +227,12 @@ def time_step(env: Any) -> float:
         value = getattr(env.unwrapped, name, None)
         if isinstance(value, int | float) and 0 < value < math.inf:
             return float(value)
-    raise InputError(f"{env} does not say how long a step is; give dt, in seconds")
+    raise InputError(f"{name_of(env)} does not say how long a step is; give dt, in seconds")
+
+
+def name_of(env: Any) -> str:
+    """An environment in a message: the name that it was made by, where it has one."""
+    return str(env.unwrapped.spec.id if env.unwrapped.spec else env.unwrapped)
 
 
 def _groups(sensors: Sequence[Sequence[int]] | None, channels: int) -> list[NDArray[np.int64]]:

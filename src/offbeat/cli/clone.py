@@ -83,6 +83,11 @@ def clone_command(
             one_of("channel", name, dataset.names)
         roles = tuple(ACTION if name in actions else STATE for name in dataset.names)
         dataset = Dataset(tuple(replace(t, roles=roles) for t in dataset), dataset.meta)
+    elif ACTION not in dataset.roles:
+        raise InputError(
+            f"{data} does not say which of its channels are actions; name them, such as "
+            f"--actions '[{dataset.names[-1]}]', of: {', '.join(dataset.names)}"
+        )
     order = np.random.default_rng(seed).permutation(len(dataset))
     held = min(round(validation * len(dataset)), len(dataset) - 1)
     policy = fit_policy(

@@ -18,13 +18,15 @@ def rollout_command(
     delay_s: float = 0.0,
     jitter_s: float = 0.0,
     steps: int | None = None,
+    dt: float | None = None,
     seed: int = 0,
     json: bool = False,
 ) -> None:
     """Run a policy in an environment of Gymnasium, with frames and sensors missing.
 
     Args:
-        policy: folder that offbeat clone wrote.
+        policy: folder that offbeat clone wrote; its observations and actions must be those of the
+            environment, in the same order.
         env: name of the environment, such as Pendulum-v1 or Hopper-v5.
         episodes: number of episodes, run side by side.
         drop: fraction of the frames that are lost.
@@ -34,6 +36,7 @@ def rollout_command(
         delay_s: s from a measurement to its arrival.
         jitter_s: s, largest error of a stamp.
         steps: that an episode is cut off after; by default as the environment says.
+        dt: s per step; by default as the environment says.
         seed: of the first episode; that of the next one is one more.
         json: print every return as JSON.
     """
@@ -52,6 +55,7 @@ def rollout_command(
         burst_s=tuple(burst_s or (0.1, 0.5)),
         delay_s=delay_s,
         jitter_s=jitter_s,
+        dt=dt,
     )
     result = {
         "environment": env,

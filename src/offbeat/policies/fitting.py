@@ -150,7 +150,8 @@ def fit_policy(
     if not acts.any() or acts.all():
         raise InputError(
             f"demonstrations need observations and actions, got the channels "
-            f"{', '.join(demonstrations.names)} with the roles {', '.join(demonstrations.roles)}"
+            f"{', '.join(demonstrations.names)} with the roles {', '.join(demonstrations.roles)}; "
+            "give those that are actions the role 'action'"
         )
     name = model if isinstance(model, str) else model.name
     if MODELS[name].factory is None and isinstance(model, str):

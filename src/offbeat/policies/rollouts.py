@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -12,10 +13,14 @@ from numpy.typing import NDArray
 from offbeat.config import check_count, check_seed
 from offbeat.data.robots import gymnasium_env
 from offbeat.errors import InputError
+from offbeat.policies.policy import Policy
 from offbeat.progress import progress_bar
 
 if TYPE_CHECKING:
     from offbeat.env import UnevenObservations
+
+OTHER_STEP = 5.0
+"""Factor between the steps of an environment and of demonstrations from which on one is warned."""
 
 
 class Controller(Protocol):
@@ -114,8 +119,8 @@ def rollout(
         Returns and lengths of the episodes.
 
     Raises:
-        InputError: the actions of the environment are no `Box`, the controller gives others, or an
-            argument is out of its range.
+        InputError: the actions of the environment are no `Box`, the controller has other
+            observations or actions, or an argument is out of its range.
         MissingExtraError: gymnasium is not installed.
     """
     check_count("episodes", episodes)
@@ -124,6 +129,8 @@ def rollout(
     check_seed(seed)
     envs = [uneven_env(env, **uneven) for _ in range(episodes)]
     space = action_space(envs[0])
+    if isinstance(controller, Policy):
+        _check_fits(controller, envs[0])
     controller.reset(episodes)
     seen = [one.reset(seed=seed + i)[0] for i, one in enumerate(envs)]
     running, arrived, asked = np.ones(episodes, dtype=bool), 0, 0
@@ -193,6 +200,37 @@ def action_space(env: Any) -> Any:
     if not isinstance(space, Box) or len(space.shape) != 1:
         raise InputError(f"actions must be a Box of one dimension, got {space}")
     return space
+
+
+def _check_fits(policy: Policy, env: UnevenObservations) -> None:
+    """Refuses an environment of other channels, and warns of one whose steps have another length.
+
+    Args:
+        policy: to be run.
+        env: that it is run in.
+    """
+    from offbeat.env import name_of
+
+    name = name_of(env)
+    for what, own, there in (
+        ("observations", policy.observations, env.observation_space["mask"].n),
+        ("actions", policy.actions, env.action_space.shape[0]),
+    ):
+        if len(own) != there:
+            raise InputError(
+                f"{name} has {there} {what}, the policy has {len(own)} ({', '.join(own)}); give "
+                "the environment of its demonstrations"
+            )
+    gap = policy.model.statistics.median_gap
+    if not 1 / OTHER_STEP <= gap / env.dt <= OTHER_STEP:
+        logging.getLogger("offbeat").warning(
+            "a step of %s is %g s, and the rows of the demonstrations are %.3g s apart; read them "
+            "with their rate (--reader.rate_hz %g) if that is not so",
+            name,
+            env.dt,
+            gap,
+            1 / env.dt,
+        )
 
 
 def _later(seen: dict[str, NDArray[Any]], dt: float) -> dict[str, NDArray[Any]]:
