@@ -2,11 +2,14 @@
 
     python benchmarks/trend.py step
     python benchmarks/trend.py log g1 --epochs 10
+    python benchmarks/trend.py blend lasa --epochs 10
 
 `step` measures the processor time of training steps of both, in turns within one process. `log`
 trains bare models (no blend) on the tasks of a log of `examples.real_logs`, and counts on its test
 part where they are more than 2 % worse than the best of last value, constant velocity and mean in
 hindsight, per channel and task; and where the trained model is more than 2 % worse than its filter.
+`blend` fits blends of the baselines with each candidate of `offbeat.ladder`, all trained equally
+long, and prints their validation scores and the RMSE on the test part beside that of the first.
 """
 
 from __future__ import annotations
@@ -21,8 +24,9 @@ import torch
 from common import synthetic
 
 import offbeat as ob
+from offbeat.answers.blend import fit_blend
 from offbeat.baselines import fit_baseline
-from offbeat.ladder import CANDIDATES
+from offbeat.ladder import CANDIDATES, fit_ladder
 from offbeat.models.zoo import recipe_of
 from offbeat.run import FlatParameters, RunState
 from offbeat.training import Examples, train_step
@@ -112,10 +116,40 @@ def log(name: str, epochs: int, seed: int) -> None:
     show(f"{PLAIN}, {epochs} epochs", trained(PLAIN, epochs=epochs)[1], oracle)
 
 
+def blend(name: str, epochs: int, seed: int) -> None:
+    """Prints the errors of blends with each candidate for the same number of epochs."""
+    from examples.real_logs.logs import LOGS
+    from examples.real_logs.predictors import Blended
+    from examples.real_logs.scores import score
+
+    log = LOGS[name](False)
+    config = ob.TrainConfig(seed=seed, tasks=log.task_config, epochs=epochs)
+    asked = [task for part in log.asked.values() for task in part]
+    first: np.ndarray | None = None
+    for candidate in CANDIDATES:
+        if candidate.learning_rate != RATE:
+            continue
+        found = fit_ladder(
+            log.train, log.validation, config, candidates=(candidate,), budget_s=1.0,
+            scaler="robust", seed=seed, progress=False,
+        )  # fmt: skip
+        fitted = fit_blend(log.train, log.validation, found.model, tasks=log.task_config, seed=seed)
+        predictor = Blended(fitted, causal=True)
+        errors = np.array([score(t, predictor, log.scale)["rmse_scaled"] for t in asked])
+        first = errors if first is None else first
+        ratio = np.exp(np.log(errors / first).mean())
+        print(
+            f"{name}, seed {seed}, {candidate.label}: validation {found.fit.validation_score:.3f}, "
+            f"RMSE {ratio:.3f} of the first candidate's (geometric mean of {len(asked)} tasks): "
+            + ", ".join(f"{t.name} {e:.3g}" for t, e in zip(asked, errors, strict=True)),
+            flush=True,
+        )
+
+
 def main() -> None:
     """Runs a part."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=("step", "log"))
+    parser.add_argument("part", choices=("step", "log", "blend"))
     parser.add_argument("name", nargs="?", default="g1")
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--repeats", type=int, default=60)
@@ -124,6 +158,8 @@ def main() -> None:
     torch.set_num_threads(1)
     if options.part == "step":
         step(options.repeats)
+    elif options.part == "blend":
+        blend(options.name, options.epochs, options.seed)
     else:
         log(options.name, options.epochs, options.seed)
 

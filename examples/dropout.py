@@ -132,8 +132,8 @@ def main() -> None:
     span = (middle - given.dropout_s / 2, middle + given.dropout_s / 2)
     dropped = [i for i, name in enumerate(whole.names) if any(word in name for word in words)]
     seen = ob.Dataset((hidden(whole, dropped, *span),))
-    live = ob.impute(learned.blend, seen, mode="causal")[0]
-    after = ob.impute(learned.blend, seen)[0]
+    live = ob.impute(learned, seen, mode="causal")[0]
+    after = ob.impute(learned, seen)[0]
     at, rows = (
         [whole.names.index(n) for n in shown],
         (whole.times > span[0]) & (whole.times < span[1]),

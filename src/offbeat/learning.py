@@ -67,6 +67,12 @@ class Learned:
     chosen: Plan | None
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        parts = (self.blend, self.train, self.validation, self.test, self.fit)
+        names = ("blend", "train", "validation", "test", "fit")
+        shown = (f"{name}={part!r}" for name, part in zip(names, parts, strict=True))
+        return "\n".join(("Learned(", *(f"    {line}," for line in shown), ")", *self.notes))
+
 
 def learn(
     dataset: Dataset,
@@ -122,7 +128,7 @@ def learn(
 
     Example:
         >>> learned = learn(offbeat.read("arm.csv"), "runs/arm")  # doctest: +SKIP
-        >>> offbeat.forecast(learned.blend, log, 0.5)[0].interval(0.9)  # doctest: +SKIP
+        >>> offbeat.forecast(learned, log, 0.5)[0].interval(0.9)  # doctest: +SKIP
     """
     dataset = Dataset.of(dataset)
     check_seed(seed)

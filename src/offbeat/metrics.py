@@ -1,9 +1,9 @@
 """Scores of predictions against a batch.
 
 `after_first_observation` is the default everywhere: it counts known values after the first
-observation of their channel, which is the honest choice, since before it every model can only
-predict the mean. `after_first_row` and `published` are given as well because published numbers
-use them; `docs/deviations.md` defines them.
+observation of their channel, since before it every model can only predict the mean.
+`after_first_row` and `published` are given as well because published numbers use them;
+`docs/deviations.md` defines them.
 """
 
 from __future__ import annotations

@@ -91,6 +91,16 @@ class FitResult:
     best_epoch: int = 0
     diverged: str = ""
 
+    def __repr__(self) -> str:
+        best = f", best epoch {self.best_epoch}" if self.best_epoch else ""
+        score = self.validation_score
+        scored = "" if math.isnan(score) else f", validation score {score:.4g}"
+        stopped = ", stopped early" if self.stopped_early else ""
+        return (
+            f"FitResult({len(self.history)} epochs, {self.steps} steps{best}{scored}{stopped}"
+            f"{', diverged' if self.diverged else ''})"
+        )
+
     @property
     def validation_score(self) -> float:
         """The best validation score; NaN if there is none."""
@@ -157,6 +167,11 @@ def fit(
         DivergenceError: the loss is no longer finite and no best weights are kept; the last good
             checkpoint is.
     """
+    if not isinstance(model, BaseModel):
+        raise InputError(
+            f"expected a model of make_model or load_model, got {type(model).__name__}; "
+            "offbeat.make_model('gru', train) makes one"
+        )
     sharded: ShardedDataset | None = None
     if isinstance(train, ShardedDataset):
         sharded, whole = train, train.sample(REFERENCE_TASKS)

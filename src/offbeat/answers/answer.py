@@ -16,7 +16,7 @@ from offbeat.errors import InputError
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Answer(Trajectory):
     """A trajectory of predictions, with their intervals where they were fitted.
 
@@ -32,6 +32,10 @@ class Answer(Trajectory):
     place: Place | None = None
     unit: Array | None = None
     beyond: NDArray[np.bool_] | None = None
+
+    def __repr__(self) -> str:
+        intervals = "without" if self.widths is None else "with"
+        return f"{super().__repr__()[:-1]}, {intervals} intervals)"
 
     def half_width(self, level: float = 0.9) -> Array:
         """Half the width of the interval that holds the true value with a probability.

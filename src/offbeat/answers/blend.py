@@ -101,6 +101,13 @@ class Blend:
     forward: BaseModel | None = None
     backward: BaseModel | None = None
 
+    def __repr__(self) -> str:
+        models = [m.name for m in (self.forward, self.backward) if m is not None]
+        return (
+            f"Blend({self.channels} channels, forecasts up to {self.tasks.horizon_s:g} s, models: "
+            f"{', '.join(models) or 'none'}, causal baselines: {', '.join(self.stack.members)})"
+        )
+
     @property
     def name(self) -> str:
         """Its name in tables."""

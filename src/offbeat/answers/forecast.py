@@ -8,15 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from offbeat.answers.blend import Blend
-from offbeat.answers.predict import increasing_seconds, predict
+from offbeat.answers.predict import Answering, answering, increasing_seconds, predict
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError
-from offbeat.models.base import BaseModel
 
 
 def forecast(
-    model: BaseModel | Blend,
+    model: Answering,
     dataset: Dataset,
     horizons: ArrayLike,
     *,
@@ -25,7 +23,7 @@ def forecast(
     """Predicts each trajectory after its last row.
 
     Args:
-        model: a trained model, or a blend, whose forecasts have intervals.
+        model: a trained model, or a blend or the result of `learn`, whose forecasts have intervals.
         dataset: the observed data.
         horizons: s after the last row: one number, or several that increase strictly, above 0.
         device: that the model is computed on, as of `fit`, and moved back from; by default its own.
@@ -38,7 +36,7 @@ def forecast(
         InputError: horizons that are not above 0 or do not increase, other channels than the
             model's, or a model that cannot predict at any time.
     """
-    dataset = Dataset.of(dataset)
+    model, dataset = answering(model), Dataset.of(dataset)
     after = checked_horizons(horizons)
     times = [t.times[-1] + after for t in dataset]
     predicted = predict(model, dataset, times=times, device=device)

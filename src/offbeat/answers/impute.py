@@ -11,7 +11,9 @@ import torch
 from offbeat.answers.answer import Answer
 from offbeat.answers.blend import Blend
 from offbeat.answers.predict import (
+    Answering,
     Times,
+    answering,
     check_any_time,
     predict,
     times_of_each,
@@ -28,7 +30,7 @@ MODES = ("causal", "two_sided")
 
 
 def impute(
-    model: BaseModel | Blend,
+    model: Answering,
     dataset: Dataset,
     *,
     mode: Literal["causal", "two_sided"] | None = None,
@@ -46,7 +48,7 @@ def impute(
     values.
 
     Args:
-        model: a trained model; or a blend, whose fills have intervals.
+        model: a trained model; or a blend or the result of `learn`, whose fills have intervals.
         dataset: the observed data.
         mode: `causal` or `two_sided`; by default two-sided where the model is a blend.
         times: s, at which a row is added where there is none: one array for all trajectories, or
@@ -65,7 +67,7 @@ def impute(
             and `rate_hz` together or invalid, or rows to add for a model that cannot predict at
             any time.
     """
-    dataset = Dataset.of(dataset)
+    model, dataset = answering(model), Dataset.of(dataset)
     mode = mode or ("causal" if isinstance(model, BaseModel) else "two_sided")
     one_of("mode", mode, MODES)
     if times is not None and rate_hz is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -24,8 +25,38 @@ from offbeat.models.model import Model
 Times = ArrayLike | Sequence[ArrayLike]
 
 
+class HasBlend(Protocol):
+    """What `offbeat.learn` returns: a blend, and more."""
+
+    @property
+    def blend(self) -> Blend:
+        """Answers predictions, fills and forecasts."""
+
+
+Answering = BaseModel | Blend | HasBlend
+"""What can be asked: a trained model, a blend, or the result of `offbeat.learn`."""
+
+
+def answering(model: Answering) -> BaseModel | Blend:
+    """The model or the blend that answers.
+
+    Args:
+        model: a trained model, a blend, or the result of `offbeat.learn`.
+
+    Raises:
+        InputError: it is something else.
+    """
+    found = getattr(model, "blend", model)
+    if isinstance(found, BaseModel | Blend):
+        return found
+    raise InputError(
+        f"expected a trained model, a blend or the result of offbeat.learn, got "
+        f"{type(model).__name__}; offbeat.load_run reads the folder of a run"
+    )
+
+
 def predict(
-    model: BaseModel | Blend,
+    model: Answering,
     dataset: Dataset,
     *,
     times: Times | None = None,
@@ -40,7 +71,7 @@ def predict(
     row in which nothing is observed.
 
     Args:
-        model: a trained model, or a blend, whose answers have intervals.
+        model: a trained model, or a blend or the result of `learn`, whose answers have intervals.
         dataset: what was observed; masked values are not used.
         times: s, on the clock of the trajectories, strictly increasing: one time or one array for
             all trajectories, or one array per trajectory. By default the times of each
@@ -59,7 +90,7 @@ def predict(
             increasing order, or a model that cannot predict at any time (see
             `thesis_config`).
     """
-    dataset = Dataset.of(dataset)
+    model, dataset = answering(model), Dataset.of(dataset)
     check_seed(seed)
     if isinstance(size, bool) or not isinstance(size, int) or size < 1:
         raise InputError(f"size must be a number of trajectories of at least 1, got {size!r}")

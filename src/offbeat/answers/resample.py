@@ -11,13 +11,13 @@ from offbeat import baselines
 from offbeat.answers.answer import Answer
 from offbeat.answers.blend import Blend, fit_blend
 from offbeat.answers.impute import impute
+from offbeat.answers.predict import Answering
 from offbeat.config import check_seed
 from offbeat.data.plan import CHOSEN, plan, prepare
 from offbeat.data.rows import add_rows, even_times
 from offbeat.data.splits import apply_split
 from offbeat.data.trajectory import EXOGENOUS, Dataset, Trajectory
 from offbeat.errors import InputError
-from offbeat.models.base import BaseModel
 
 CAUSAL = ("last_value", "mean", "constant_velocity")
 TWO_SIDED = ("linear", "pchip", "smoother")
@@ -32,7 +32,7 @@ _TASKS = 200  # drawn from each part, to weigh the baselines
 def resample(
     dataset: Dataset | Trajectory,
     rate_hz: float,
-    model: BaseModel | Blend | None = None,
+    model: Answering | None = None,
     *,
     seed: int = 0,
 ) -> Dataset:
@@ -50,7 +50,7 @@ def resample(
     Args:
         dataset: what was observed.
         rate_hz: rows per second.
-        model: a blend or a trained model; None for the best simple fill.
+        model: a blend, the result of `learn`, or a trained model; None for the best simple fill.
         seed: of the generator of self-feeding, and of the tasks that the simple fill is fitted to.
 
     Returns:

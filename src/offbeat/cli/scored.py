@@ -10,23 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat import baselines, tables
-from offbeat.answers.blend import TASKS, Blend, number_of_tasks
+from offbeat import baselines
+from offbeat.answers.blend import Blend
 from offbeat.answers.forecast import forecast
 from offbeat.answers.impute import impute
-from offbeat.answers.predict import predicts_any_time
-from offbeat.answers.scoring import (
-    ChannelScores,
-    score_forecast,
-    score_imputation,
-    score_one_step,
-    training_mean,
-)
+from offbeat.answers.scoring import score_forecast, score_imputation, training_mean
 from offbeat.calibration import Calibration
 from offbeat.data.masking import masked_values
-from offbeat.data.tasks import TWO_SIDED, draw_tasks
 from offbeat.data.trajectory import Dataset, Trajectory
-from offbeat.evaluation import Evaluation
+from offbeat.evaluation import Evaluation, evaluate_blend
 from offbeat.models.base import BaseModel
 from offbeat.plots.answers import answers
 from offbeat.plots.calibration import calibration_figure
@@ -56,12 +48,17 @@ def scored(
         InputError: there are no intervals for the figure.
     """
     if isinstance(model, Blend):
-        return _scored_blend(model, dataset, evaluation, horizons, seed, calibration)
+        found = evaluate_blend(model, dataset, horizons=horizons, seed=seed)
+        if calibration is not None:
+            drawn = {s.task: s.calibration for s in found.tasks if s.calibration is not None}
+            save(calibration_figure(drawn, title=dataset[0].origin), calibration)
+        one_step = {} if evaluation is None else evaluation.to_dict()
+        return {**one_step, **found.to_dict()}, found.text()
     assert evaluation is not None
     own = evaluation.scores[model.name].calibration
     if calibration is not None:
-        drawn = {} if own is None else {"one step ahead": own}
-        save(calibration_figure(drawn, title=dataset[0].origin), calibration)
+        shown = {} if own is None else {"one step ahead": own}
+        save(calibration_figure(shown, title=dataset[0].origin), calibration)
     ahead = evaluation.in_units()
     result: dict[str, Any] = {**evaluation.to_dict(), "verdict": ahead.verdict()}
     text = [
@@ -101,81 +98,6 @@ def _intervals(model: BaseModel, found: Calibration | None) -> list[str]:
         f"intervals of {model.name}: {covered}; CRPS {found.crps:.4g}, interval score of 95 % "
         f"{score:.4g} (scaled)"
     ]
-
-
-def _scored_blend(
-    blend: Blend,
-    dataset: Dataset,
-    evaluation: Evaluation | None,
-    horizons: Sequence[float] | None,
-    seed: int,
-    calibration: Path | None,
-) -> tuple[dict[str, Any], str]:
-    """All tasks of a blend, on the same values as its model and its baselines."""
-    tasks = [score_one_step(blend, dataset, seed=seed)]
-    masked = dataset
-    if not any(masked_values(t).any() for t in dataset):
-        count = number_of_tasks(dataset, blend.tasks, TASKS)
-        masked = draw_tasks(dataset, blend.tasks, count, shares=TWO_SIDED, seed=[seed, 2])
-    fills = [score_imputation(blend, masked, mode=m, seed=seed) for m in ("causal", "two_sided")]
-    tasks += [fill.scores for fill in fills]
-    after = horizons
-    if after is None:
-        longest = max(float(t.times[-1] - t.times[0]) for t in dataset)
-        after = [h for h in default_horizons(blend) if h < longest]
-    if len(after) and (horizons is not None or predicts_any_time(blend)):
-        tasks += score_forecast(blend, dataset, after)
-    if calibration is not None:
-        drawn = {s.task: s.calibration for s in tasks if s.calibration is not None}
-        save(calibration_figure(drawn, title=dataset[0].origin), calibration)
-    result: dict[str, Any] = {} if evaluation is None else evaluation.to_dict()
-    result["tasks"] = [scores.to_dict() for scores in tasks]
-    result["gamma"] = {
-        "edges_s": blend.stack.keys.bins.edges.tolist(),
-        "channels": dict(zip(blend.names, blend.gamma.T.tolist(), strict=True)),
-    }
-    text = [overview(tasks)]
-    for scores in tasks:
-        text += ["", f"{scores.task}, RMSE in the channels' units:", scores.short()]
-    if blend.forward is not None:
-        text += ["", "weight of the model in the answer, by time since observation:"]
-        text.append(blend.gamma_table())
-    return result, "\n".join([*text, "", *(scores.verdict() for scores in tasks)])
-
-
-def default_horizons(blend: Blend) -> list[float]:
-    """s, horizons at which a blend is scored: parts of the longest one that it was made for."""
-    return [float(f"{part * blend.tasks.horizon_s:.2g}") for part in (0.1, 0.2, 0.5, 1.0)]
-
-
-def overview(tasks: Sequence[ChannelScores]) -> str:
-    """A table with a row per task: scaled RMSE of the answer and of the best predictors.
-
-    The interval score is that of 95 %.
-
-    Args:
-        tasks: scores whose first predictor is the blend.
-    """
-    head = ["task, scaled RMSE", "blend", "model", "best baseline", "", "in 50, 80, 95 %", "CRPS"]
-    lines = [[*head, "interval score"]]
-    for scores in tasks:
-        own, *others = scores.rmse
-        model = next((name for name in others if name not in scores.trivial), None)
-        best, who = min((scores.overall[p], p) for p in scores.trivial)
-        covered = scores.coverage or {}
-        lines.append(
-            [
-                scores.task,
-                f"{scores.overall[own]:.4g}",
-                "-" if model is None else f"{scores.overall[model]:.4g}",
-                f"{best:.4g}",
-                who,
-                " ".join(f"{100 * share:.0f}" for share in covered.values()),
-                "-" if scores.crps is None else f"{scores.crps:.3g}",
-                "-" if scores.interval_score is None else f"{scores.interval_score[0.95]:.3g}",
-            ]
-        )
-    return tables.plain(lines, left=(0, 4))
 
 
 def fill_figure(

@@ -105,6 +105,9 @@ class Comparison:
     conditions: tuple[ConditionResult, ...]
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        return self.text()
+
     @property
     def family(self) -> int:
         """Number of pairs that Holm's correction covers."""

@@ -40,6 +40,13 @@ class Batch:
         if not self.roles:
             object.__setattr__(self, "roles", (STATE,) * self.values.shape[2])
 
+    def __repr__(self) -> str:
+        batch, rows, channels = self.values.shape
+        kind, device = str(self.values.dtype).removeprefix("torch."), self.values.device
+        return (
+            f"Batch({batch} trajectories, up to {rows} rows, {channels} channels, {kind}, {device})"
+        )
+
     @classmethod
     def of(
         cls,

@@ -126,6 +126,13 @@ class Inspection:
     notes: tuple[str, ...]
     cleaning: dict[str, Any]
 
+    def __repr__(self) -> str:
+        rate = "" if self.rate_hz is None else f", about {self.rate_hz:.3g} Hz"
+        return (
+            f"Inspection({self.source or 'data'}: {len(self.episodes)} episodes, {self.rows} rows, "
+            f"{len(self.channels)} channels, {100 * self.known:.0f} % known{rate})"
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-like form."""
         plain = asdict(self)

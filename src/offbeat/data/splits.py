@@ -65,6 +65,7 @@ def split_in_time(
     Raises:
         InputError: fractions are not positive or do not sum to 1, or a part would be empty.
     """
+    dataset = Dataset.of(dataset)
     rows = sum(t.rows for t in dataset)
     ends = _ends(rows, fractions)
     pieces: list[list[Trajectory]] = [[] for _ in ends]
@@ -114,6 +115,7 @@ def split_in_blocks(
         InputError: fractions are not three, not positive or do not sum to 1, or a part would be
             empty.
     """
+    dataset = Dataset.of(dataset)
     rows = sum(t.rows for t in dataset)
     if len(fractions) != 3:
         raise InputError(f"a split in blocks has three fractions, got {list(fractions)}")
@@ -237,8 +239,8 @@ def _drawn(count: int, fractions: Sequence[float], seed: int) -> list[NDArray[np
     if (ends <= starts).any():
         raise InputError(
             f"{count} trajectories are too few for the fractions {list(fractions)}: a part "
-            "would be empty; use more trajectories or fewer parts, or split a long recording "
-            "by time (by='time') or in blocks (by='blocks')"
+            "would be empty; use more trajectories or fewer parts, or split a long recording with "
+            "split_in_blocks (by='blocks') or split_in_time (by='time')"
         )
     order = np.random.default_rng(seed).permutation(count)
     return [np.sort(order[start:end]) for start, end in zip(starts, ends, strict=True)]

@@ -87,7 +87,8 @@ def load(path: str | Path) -> Dataset:
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise FileFormatError(
             f"{path} can't be read as Parquet, it is truncated, damaged or of another format "
-            f"({' '.join(str(error).split())[:150]}); copy or simulate it again"
+            f"({' '.join(str(error).split())[:150]}); copy or simulate it again, or read another "
+            "format with offbeat.read"
         ) from None
     return _data_set(table, schema, path)
 

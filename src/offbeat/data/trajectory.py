@@ -172,8 +172,9 @@ class Trajectory:
 
     def __repr__(self) -> str:
         return (
-            f"Trajectory({self.rows} rows, {self.channels} channels, {self.times[0]:g} to "
-            f"{self.times[-1]:g} s, {100 * self.observed.mean():.0f} % observed)"
+            f"{type(self).__name__}({self.rows} rows, {self.channels} channels, "
+            f"{self.times[0]:g} to {self.times[-1]:g} s, "
+            f"{100 * self.observed.mean():.0f} % observed)"
         )
 
     def slice(self, start: int, stop: int) -> Trajectory:
@@ -288,7 +289,8 @@ class Dataset(Sequence[Trajectory]):
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        trajectories = tuple(self.trajectories)
+        single = isinstance(self.trajectories, Trajectory)
+        trajectories = (self.trajectories,) if single else tuple(self.trajectories)
         if not trajectories:
             raise InputError("a data set needs at least one trajectory, got none")
         first = trajectories[0]
@@ -324,7 +326,8 @@ class Dataset(Sequence[Trajectory]):
             )
         raise InputError(
             f"expected a Dataset, a Trajectory or a list of them, got {type(data).__name__}; "
-            "offbeat.read gives a data set of a file"
+            "offbeat.read gives a data set of a file, offbeat.from_pandas of a DataFrame, "
+            "offbeat.Trajectory(times, values) is one of arrays"
         )
 
     @staticmethod

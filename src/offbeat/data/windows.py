@@ -49,6 +49,7 @@ def windows(
     Raises:
         InputError: a length is not above 0, both or none are given, or a trajectory is too short.
     """
+    dataset = Dataset.of(dataset)
     cuts = [cut] * len(dataset)
     return owned_windows(dataset, length, seconds=seconds, cuts=cuts, count=count, seed=seed)[0]
 

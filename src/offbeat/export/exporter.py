@@ -20,6 +20,7 @@ from torch.overrides import TorchFunctionMode
 from offbeat import kernels
 from offbeat.answers.blend import Blend
 from offbeat.answers.intervals import LEVELS
+from offbeat.answers.predict import Answering, answering
 from offbeat.baselines.base import CausalBaseline
 from offbeat.baselines.history import History
 from offbeat.data.batch import Batch
@@ -35,7 +36,7 @@ from offbeat.stream.blend_engine import flat_state, like_state
 from offbeat.stream.stream import info_of
 
 
-def export_onnx(model: BaseModel | Blend, path: str | Path) -> None:
+def export_onnx(model: Answering, path: str | Path) -> None:
     """Writes one streaming step of a model as an ONNX file, for `OnnxStream` or any ONNX runtime.
 
     Inputs: `t` (1,) float64, s, since any fixed origin; `values` (1, channels) float64 in original
@@ -60,6 +61,7 @@ def export_onnx(model: BaseModel | Blend, path: str | Path) -> None:
             baseline that does not run on torch tensors; or another suffix.
         MissingExtraError: onnx or onnxscript is not installed.
     """
+    model = answering(model)
     forward = model.forward if isinstance(model, Blend) else model
     inner = None if forward is None else exportable(forward)
     if inner is not None and inner.acts:

@@ -88,6 +88,10 @@ class LiveStream:
             self._placing, self._reader, self._scaler, options, self._exogenous
         )
 
+    def __repr__(self) -> str:
+        newest = "" if self.time is None else f", newest row at {self.time} {self.time_unit}"
+        return f"{type(self).__name__}({len(self.names)} channels{newest})"
+
     @property
     def time_unit(self) -> str:
         """Unit of all times given to this stream."""

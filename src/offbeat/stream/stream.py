@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from offbeat.answers.blend import Blend
+from offbeat.answers.predict import Answering, answering
 from offbeat.config import check_seed
 from offbeat.data.scaler import Scaler
 from offbeat.devices import resolved
@@ -36,8 +37,8 @@ class Stream(LiveStream):
     again on its newest `window_rows` rows for each prediction.
 
     Args:
-        model: trained, a model or a blend, whose predictions have intervals; its weights must not
-            change.
+        model: trained; of a blend, or of the result of `learn`, predictions have intervals. Its
+            weights must not change.
         options: what to do with messages out of order.
         time_unit: of all times given: s, ms, us or ns. Integers are exact.
         seed: of the generator of self-feeding.
@@ -56,7 +57,7 @@ class Stream(LiveStream):
 
     def __init__(
         self,
-        model: BaseModel | Blend,
+        model: Answering,
         options: StreamOptions | None = None,
         *,
         time_unit: str = "s",
@@ -64,6 +65,7 @@ class Stream(LiveStream):
         device: str | torch.device | None = None,
         **fields: Any,
     ) -> None:
+        model = answering(model)
         chosen, seed = with_options(options, fields), check_seed(seed)
         forward = model.forward if isinstance(model, Blend) else model
         if device is not None and forward is not None:
