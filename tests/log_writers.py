@@ -7,10 +7,13 @@ then covers it without a new test.
 from __future__ import annotations
 
 import csv
+import json
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.feather as feather
 import pyarrow.parquet as pq
+from scipy.io import savemat
 
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset, Trajectory
@@ -57,6 +60,43 @@ def write_long_parquet(path, stamps, values):
 def write_npz(path, stamps, values):
     np.savez(path.with_suffix(".npz"), time_ns=stamps, joints=values, names=["hip", "knee"])
     return path.with_suffix(".npz")
+
+
+def write_feather(path, stamps, values):
+    columns = {"time_ns": stamps, "hip": values[:, 0], "knee": values[:, 1]}
+    feather.write_feather(pa.table(columns), path.with_suffix(".feather"))
+    return path.with_suffix(".feather")
+
+
+def write_json(path, stamps, values):
+    lines = [
+        json.dumps({"time_ns": int(t), "hip": number_of(x), "knee": number_of(y)})
+        for t, (x, y) in zip(stamps, values, strict=True)
+    ]
+    path.with_suffix(".jsonl").write_text("\n".join(lines) + "\n")
+    return path.with_suffix(".jsonl")
+
+
+def number_of(value):
+    """A number of JSON: null where nothing is known."""
+    return None if np.isnan(value) else float(value)
+
+
+def write_mat(path, stamps, values):
+    arrays = {"time_ns": np.asarray(stamps), "hip": values[:, 0], "knee": values[:, 1]}
+    savemat(path.with_suffix(".mat"), {"walk": arrays})
+    return path.with_suffix(".mat")
+
+
+def write_ardupilot(path, stamps, values):
+    """A log in text, whose stamps are in microseconds."""
+    lines = ["FMT, 1, 20, WALK, Qff, TimeUS,hip,knee"]
+    lines += [
+        f"WALK, {t // 1000}, {float(x)!r}, {float(y)!r}"
+        for t, (x, y) in zip(stamps, values, strict=True)
+    ]
+    path.with_suffix(".log").write_text("\n".join(lines) + "\n")
+    return path.with_suffix(".log")
 
 
 def write_tum(path, stamps, values):
@@ -109,6 +149,10 @@ WRITERS = {
     "parquet long": write_long_parquet,
     "npz": write_npz,
     "npz written": written("npz", ".npz"),
+    "feather": write_feather,
+    "json": write_json,
+    "mat": write_mat,
+    "ardupilot": write_ardupilot,
     "tum": write_tum,
     "euroc": write_euroc_file,
     "euroc folder": write_euroc_folder,

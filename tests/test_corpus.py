@@ -89,7 +89,7 @@ def test_a_text_file_is_read_in_the_form_it_has(name, tmp_path):
     assert trajectory.times == pytest.approx(tables.TIMES, abs=1e-12)
     assert trajectory.values.tolist() == np.column_stack([tables.X, tables.Y]).tolist()
     assert note in notes(dataset)
-    assert dataset.units == (("m", "deg") if "units" in name else ("", ""))
+    assert dataset.units == (("m", "deg") if "unit" in name else ("", ""))
 
 
 @pytest.mark.parametrize(("suffix", "pack"), [("gz", gzip), ("bz2", bz2), ("xz", lzma)])

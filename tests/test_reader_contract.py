@@ -24,7 +24,16 @@ RNG = np.random.default_rng(0)
 STAMPS = START + 1000 * np.cumsum(RNG.integers(1000, 30_000, 150))
 VALUES = RNG.normal(size=(150, 2))
 TEXT = ("csv", "csv long", "tum", "euroc", "euroc folder")
-UP_TO_THE_CUT = ("csv", "tum", "euroc", "ros", "ulog")  # formats of lines and of messages
+# Formats of lines and of messages.
+UP_TO_THE_CUT = (
+    "ardupilot",
+    "csv",
+    "json",
+    "tum",
+    "euroc",
+    "ros",
+    "ulog",
+)
 SKIPPED = {"offbeat": "a data set of ours is finished: it has no clock and is not cleaned"}
 
 

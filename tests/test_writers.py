@@ -10,6 +10,7 @@ import pytest
 
 import offbeat as ob
 from offbeat.data.writers import WRITERS, register_writer, save
+from offbeat.data.writers.tables import write_table
 
 
 def made(**meta) -> ob.Dataset:
@@ -35,10 +36,23 @@ def test_a_table_that_is_read_back_has_the_same_times_values_names_and_units(
     assert again.meta["labels"] == (labels or ["0", "1"])
 
 
+@pytest.mark.parametrize("step", [10.0, 11.0, 60.0, 3600.0, 86_400.0])
+@pytest.mark.parametrize("suffix", ["csv", "pq"])
+def test_times_of_any_step_are_read_back_in_seconds(step, suffix, tmp_path):
+    slow = ob.Trajectory(step * np.arange(50), np.ones((50, 1)), names=("x",))
+    save(ob.Dataset([slow]), tmp_path / f"walk.{suffix}")
+    (again,) = ob.read(tmp_path / f"walk.{suffix}", max_gap_s=None, clock_jumps="join")
+    assert again.times.tolist() == slow.times.tolist()
+    columns = {"trajectory": [0] * 50, "time": slow.times, "x": [1] * 50, "x|observed": [True] * 50}
+    write_table(tmp_path / f"filled.{suffix}", columns)
+    (again,) = ob.read(tmp_path / f"filled.{suffix}", max_gap_s=None, clock_jumps="join")
+    assert again.times.tolist() == slow.times.tolist()
+
+
 def test_columns_are_called_by_channel_and_unit(tmp_path):
     save(made(), tmp_path / "walk.pq")
     names = pq.read_schema(tmp_path / "walk.pq").names
-    assert names == ["trajectory", "time", "hip [rad]", "knee"]
+    assert names == ["trajectory", "time [s]", "hip [rad]", "knee"]
 
 
 def test_the_suffix_parquet_is_the_own_format(tmp_path):

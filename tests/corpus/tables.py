@@ -30,12 +30,17 @@ def write_csv(path: Path, columns: Columns, *, delimiter: str = ",") -> Path:
     """A header and rows; None and NaN are empty fields."""
     lines = [delimiter.join(columns)]
     lines += [
-        delimiter.join("" if v is None or v != v else str(v) for v in row)
+        delimiter.join(_field(v, delimiter) for v in row)
         for row in zip(*columns.values(), strict=True)
     ]
     path = path.with_suffix(".csv")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
+
+
+def _field(value: Any, delimiter: str) -> str:
+    text = "" if value is None or value != value else str(value)
+    return f'"{text}"' if delimiter in text else text
 
 
 def write_parquet(path: Path, columns: Columns) -> Path:
@@ -82,18 +87,22 @@ class Kind:
     units: Mapping[str, str] = field(default_factory=dict)
 
 
-def texts(stamps: Any, form: str) -> list[str]:
+def texts(stamps: Any, form: str, *, fraction: bool = True) -> list[str]:
     """Nanoseconds as texts of a date and time."""
-    return [_text(int(t), form) for t in stamps]
+    return [_text(int(t), form, fraction=fraction) for t in stamps]
 
 
-def _text(nanoseconds: int, form: str) -> str:
+def _text(nanoseconds: int, form: str, *, fraction: bool = True) -> str:
     moment = datetime.fromtimestamp(nanoseconds // 10**9, UTC)
-    return moment.strftime(form) + f".{nanoseconds % 10**9:09d}"
+    return moment.strftime(form) + (f".{nanoseconds % 10**9:09d}" if fraction else "")
 
 
 XY = {"x": X, "y": Y}
 SEC, REST = NS // 10**9, NS % 10**9
+ONES = np.arange(ROWS, dtype=float)
+SLOW = NS[0] + 10**9 * np.arange(ROWS)
+EITHER = NS + 226 * 86_400 * 10**9  # 8 July
+WEEK = 30_240_000 - 20 + np.arange(ROWS)  # steps of 20 ms, past the end of a week
 TWO = {"GyrX": np.ravel(np.column_stack([X, Y])), "AccZ": np.tile([-9.8, -10.8], ROWS)}
 NIGHT = 86_400 * 10**9 - STEP_NS * 10 + STEP_NS * np.arange(ROWS)  # passes midnight
 NOON = (12 * 3600 + 59 * 60 + 59) * 10**9 + STEP_NS * np.arange(20, 20 + ROWS)  # passes 1 PM
@@ -144,6 +153,65 @@ KINDS: dict[str, Kind] = {
     "texts of ISO 8601": Kind({"time": texts(NS, "%Y-%m-%dT%H:%M:%S"), **XY}, XY),
     "texts with slashes": Kind({"time": texts(NS, "%Y/%m/%d %H:%M:%S"), **XY}, XY),
     "texts with the day first": Kind({"time": texts(NS, "%d.%m.%Y %H:%M:%S"), **XY}, XY),
+    **{
+        f"dates as {form}": Kind({"time": texts(NS, form), **XY}, XY)
+        for form in (
+            "%m/%d/%Y %H:%M:%S",
+            "%d/%m/%Y %H:%M:%S",
+            "%d-%m-%Y %H:%M:%S",
+            "%d %b %Y %H:%M:%S",
+            "%B %d, %Y %H:%M:%S",
+            "%a, %d %b %Y %H:%M:%S",
+            "%Y%m%dT%H%M%S",
+            "%Y%m%d_%H%M%S",
+            "%Y-%m-%d_%H-%M-%S",
+            "%Y-%jT%H:%M:%S",
+            "%Y.%m.%d %H:%M:%S",
+            "%d-%b-%Y %H:%M:%S",
+        )
+    },
+    "dates in halves of a day": Kind(
+        {"time": [f"{t} PM" for t in texts(NS, "%m/%d/%Y %I:%M:%S")], **XY}, XY
+    ),
+    "dates with an offset": Kind(
+        {"time": [f"{t}+02:00" for t in texts(NS, "%d %b %Y %H:%M:%S")], **XY}, XY
+    ),
+    "dates of C": Kind(
+        {"time": texts(SLOW, "%a %b %d %H:%M:%S 2025", fraction=False), **XY}, XY, times=ONES
+    ),
+    "a date of the month first beside its time": Kind(
+        {
+            "Date": texts(SLOW, "%m/%d/%Y", fraction=False),
+            "Time": texts(SLOW, "%I:%M:%S PM", fraction=False),
+            **XY,
+        },
+        XY,
+        times=ONES,
+        note="joined from columns 'Date' and 'Time'",
+    ),
+    "dates whose day and month may be swapped": Kind(
+        {"time": texts(EITHER, "%d/%m/%Y %H:%M:%S"), **XY}, XY, options={"day_first": True}
+    ),
+    "milliseconds behind a colon": Kind(
+        {"time": [f"2025-11-24 16:00:{i // 50:02d}:{i % 50 * 20:03d}" for i in range(ROWS)], **XY},
+        XY,
+    ),
+    "minutes and seconds that pass the hour": Kind(
+        {"time": [f"{(59 + i // 20) % 60:02d}:{3 * (i % 20):02d}.0" for i in range(ROWS)], **XY},
+        XY,
+        times=3 * ONES,
+    ),
+    "a week of GPS and seconds": Kind(
+        {"week": 2400 + (WEEK >= 30_240_000), "tow": WEEK % 30_240_000 / 50, **XY},
+        XY,
+        note="joined from columns 'week' and 'tow'",
+    ),
+    "a week of GPS and milliseconds": Kind(
+        {"GWk": 2400 + (WEEK >= 30_240_000), "GMS": WEEK % 30_240_000 * 20, **XY}, XY
+    ),
+    "milliseconds of a week of u-blox": Kind(
+        {"iTOW": 345_600_000 + 1000 * np.arange(ROWS), **XY}, XY, times=ONES
+    ),
     "milliseconds in brackets without a blank": Kind(
         {"time(ms)": 20 * np.arange(ROWS), "angle(deg)": X, "x[0]": Y},
         {"angle": X, "x[0]": Y},
@@ -351,6 +419,17 @@ TEXTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
         "time,x,y\n" + BODY[:-2].rpartition("\n")[0] + f"\n0.78,{X[-1]},{Y[-1]}", {}, "",
     ),
     "plus signs": ("time,x,y\n" + BODY.replace(",0.", ",+0."), {}, ""),
+    "numbers with their units": (
+        "time,x,y\n" + "".join(
+            f"{20 * i} ms,{x} m,{y} deg\n" for i, (x, y) in enumerate(zip(X, Y, strict=True))
+        ), {}, "numbers have a unit in each field: 'time [ms]', 'x [m]', 'y [deg]'",
+    ),
+    "numbers with their units and decimal commas": (
+        "time;x;y\n" + "".join(
+            f"{t:.2f}s;{x}m;{y}deg\n" for t, x, y in zip(TIMES, X, Y, strict=True)
+        ).replace(".", ","), {}, "numbers have a unit in each field",
+    ),
+    "UTF-16 without a mark": (("time,x,y\n" + BODY).encode("utf-16-le"), {}, "without a mark"),
     "UTF-16": (("time,x,y\n" + BODY).encode("utf-16"), {}, ""),
     "Windows-1252": ("time,x,y,d\xe9j\xe0\n".encode("cp1252")
                      + BODY.replace("\n", ",1\n").encode(), {"without": ["d\xe9j\xe0"]},
@@ -430,7 +509,7 @@ REFUSED: dict[str, tuple[Columns, dict[str, Any], str]] = {
     "dates of either order": (
         {"Date": ["11/12/2025"] * ROWS, "Time": of_day(NS), **XY},
         {},
-        "has dates such as '11/12/2025'",
+        "dates such as '11/12/2025' may begin with the day or the month; .*day_first=true",
     ),
     "several stamps": (
         {"imu/stamp/sec": SEC, "imu/stamp/nanosec": REST, "odom/stamp/sec": SEC,

@@ -56,6 +56,7 @@ TIME_NAMES = (
     *("times", "timestamps", "time_stamp", "datetime", "date_time", "elapsed", "elapsed_time"),
     *("rosbag_timestamp", "ros_time", "header_stamp", "field_header_stamp", "log_time"),
     *("epoch", "unix_time", "unixtime", "utc", "utc_time", "sec", "secs", "seconds", "ts"),
+    *("tow", "gps_tow", "time_of_week", "itow", "i_tow", "tout"),
     *("gps_time", "uptime", "zeit", "zeitstempel", "uhrzeit", "x_value", *_ALONE),
 )
 """Names of time columns, in any case; the first one in a file is used. Names with a
@@ -112,7 +113,7 @@ def folded(name: str) -> str:
     """A column's name without its unit, as it is compared: `%TimeUS`, `time.us` are `time_us`."""
     stem = split_unit(name)[0].lstrip("#%_ \t")
     stem = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", stem)
-    return re.sub(r"[\s./:\-]+", "_", stem).strip("_").casefold()
+    return re.sub(r"[\s./:,\-]+", "_", stem).strip("_").casefold()
 
 
 def time_unit_in(name: str) -> str | None:
@@ -121,6 +122,8 @@ def time_unit_in(name: str) -> str | None:
     if unit:
         return _UNIT_OF.get(unit.casefold())
     stem, _, last = folded(name).rpartition("_")
+    if last in ("itow", "tow") and stem in ("", "i") and folded(name) != "tow":
+        return "ms"  # of u-blox
     if stem and (last not in ("d", "h", "min") or stem in _LONG):
         return _UNIT_OF.get(last)
     alone = last in ("sec", "secs", "seconds", *_ALONE)
@@ -144,13 +147,45 @@ def time_column_of(names: Sequence[str]) -> str | None:
     return next((n for s, n in stems.items() if s.endswith(("_timestamp", "_stamp"))), None)
 
 
+_LAST = (
+    *("time", "timestamp", "stamp", "clock", "clk", "ts", "monotonic", "zeit", "temps", "tiempo"),
+    *("tempo", "tijd", "czas", "время", "時間", "时间"),
+)
+
+
+def may_be_time(name: str) -> bool:
+    """Whether a name ends like one of times, before its unit: `sim_time`, `ts_ms`."""
+    words = folded(name).split("_")
+    if len(words) > 1 and words[-1] in _UNIT_OF:
+        words.pop()
+    return words[-1].endswith(_LAST[:3]) or words[-1] in _LAST
+
+
 _SPLIT = {"ns": 10**9, "us": 10**6, "ms": 10**3}  # counts of the second column per second
+_WEEK = {"s of a week": 1, "ms of a week": 1000}  # as GPS counts: weeks, and what is left of each
+_WEEKS = ("week", "gps_week", "gpsweek", "gwk", "gps_wk", "wn", "wno", "week_number", "gps_wn")
+_OF_WEEK = (
+    *(
+        "tow",
+        "gps_tow",
+        "gpstow",
+        "time_of_week",
+        "gps_time_of_week",
+        "itow",
+        "i_tow",
+        "gms",
+        "sow",
+    ),
+    *("tow_ms", "tow_s", "gps_tow_ms", "gps_tow_s", "week_ms", "gps_ms", "gps_sow", "week_seconds"),
+    *("week_seconds", "seconds_of_week", "gps_seconds", "gps_second", "gps_seconds_of_week"),
+)
 
 
 def split_stamps(names: Sequence[str]) -> list[tuple[str, str, str]]:
     """Pairs of columns that may hold a stamp together: seconds, the rest, and unit of the rest.
 
-    Such as `sec` and `nanosec`, `stamp.secs` and `stamp.nsecs`, `time_s` and `time_us`.
+    Such as `sec` and `nanosec`, `stamp.secs` and `stamp.nsecs`, `time_s` and `time_us`; or a week
+    of GPS and the time of the week, which may be in either unit.
     """
     wholes: dict[str, str] = {}
     for name in names:
@@ -163,6 +198,10 @@ def split_stamps(names: Sequence[str]) -> list[tuple[str, str, str]]:
         unit = _UNIT_OF.get(last, "")
         if unit in _SPLIT and stem in wholes:
             found.append((wholes[stem], name, unit))
+    weeks = next((name for name in names if folded(name) in _WEEKS), None)
+    rest = next((name for name in names if folded(name) in _OF_WEEK), None)
+    if weeks is not None and rest is not None:
+        found += [(weeks, rest, unit) for unit in _WEEK]
     return found
 
 
@@ -171,8 +210,11 @@ def is_rest(whole: ArrayLike, rest: ArrayLike, unit: str) -> bool:
     seconds, left = np.asarray(whole, dtype=np.float64), np.asarray(rest, dtype=np.float64)
     if not seconds.size or seconds.shape != left.shape:
         return False
-    fits = (seconds == np.floor(seconds)) & (left == np.floor(left)) & (left >= 0)
-    return bool((fits & (left < _SPLIT[unit])).all())
+    fits = (seconds == np.floor(seconds)) & (left >= 0)
+    if unit in _WEEK:
+        fits &= (seconds >= 0) & (seconds < 10_000) & (left < 604_800 * _WEEK[unit])
+        return bool(fits.all()) and (unit == "s of a week") == bool(left.max() < 604_800)
+    return bool((fits & (left == np.floor(left)) & (left < _SPLIT[unit])).all())
 
 
 def join_stamp(whole: NDArray[Any], rest: NDArray[Any], unit: str) -> NDArray[np.int64]:
@@ -181,15 +223,18 @@ def join_stamp(whole: NDArray[Any], rest: NDArray[Any], unit: str) -> NDArray[np
     Args:
         whole: (n,) seconds.
         rest: (n,) what is left of each, in `unit`.
-        unit: `ns`, `us` or `ms`.
+        unit: `ns`, `us`, `ms`, or one of a week; the stamp then counts from the first week of GPS.
 
     Raises:
         FileFormatError: they are no such numbers.
     """
+    if unit in _WEEK and is_rest(whole, rest, unit):
+        within = np.rint(np.asarray(rest) * (1e9 / _WEEK[unit])).astype(np.int64)
+        return np.asarray(whole).astype(np.int64) * (604_800 * 10**9) + within
     if not is_rest(whole, rest, unit):
         raise FileFormatError(
-            f"a stamp in two columns must be whole seconds, and from 0 to {_SPLIT[unit] - 1} "
-            f"{unit}; name the column of the time with time_column"
+            "a stamp in two columns must be whole seconds, and from 0 to "
+            f"{_SPLIT.get(unit, 604_800) - 1} {unit}; name the column of the time with time_column"
         )
     seconds, left = np.asarray(whole).astype(np.int64), np.asarray(rest).astype(np.int64)
     if int(np.abs(seconds).max()) >= 2**63 // 10**9:

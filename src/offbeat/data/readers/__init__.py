@@ -15,7 +15,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 from offbeat.data import store
-from offbeat.data.readers import hdf5, lerobot, npz, parquet, pose, ros, table, text, ulog
+from offbeat.data.readers import (
+    ardupilot,
+    hdf5,
+    json_lines,
+    lerobot,
+    mat,
+    npz,
+    parquet,
+    pose,
+    ros,
+    table,
+    text,
+    ulog,
+)
 from offbeat.data.readers.folders import FILES, check_paths, files_in, together
 from offbeat.data.readers.options import check_types
 from offbeat.data.recording import ReaderOptions, Recording, assemble
@@ -45,6 +58,24 @@ PACKED = {
     ".tgz": "tar xf",
 }
 """Suffixes of compressed files and archives, each with the command that unpacks it."""
+
+CONVERTED = {
+    ".bin": "not read; a log of ArduPilot is written as text with: mavlogdump.py LOG.bin > LOG.log",
+    ".tlog": "not read; write it as CSV with: mavlogdump.py --format csv --types ATTITUDE LOG.tlog",
+    ".xlsx": "a workbook of Excel; save its sheet as CSV",
+    ".xls": "a workbook of Excel; save its sheet as CSV",
+    ".ods": "a workbook; save its sheet as CSV",
+    ".mf4": "an MDF file; write it as Parquet with: MDF(path).to_dataframe().to_parquet(out)",
+    ".tdms": "a TDMS file; write it as Parquet with npTDMS: TdmsFile.read(path).as_dataframe()",
+    ".orc": "an ORC file; write it as Parquet",
+    ".avro": "an Avro file; write it as Parquet",
+    ".tfrecord": "a TFRecord file; write its numbers as NPZ or Parquet",
+    ".zarr": "a Zarr store; write its arrays as NPZ",
+}
+"""What is not read, by suffix, and how to convert it."""
+
+_OF_TEXT = ("ardupilot", "json", "csv")
+"""Formats whose files may be compressed."""
 
 FOLDER = "/"
 """The suffix for readers of folders, which must have `recognises`."""
@@ -338,8 +369,11 @@ def reader_of(path: Path) -> Reader:
     suffix = FOLDER if path.is_dir() else path.suffix.lower()
     if suffix in PACKED:
         inner = Path(path.stem).suffix.lower()
-        if suffix in text.COMPRESSED and inner in READERS["csv"].suffixes:
-            return READERS["csv"]
+        texts = [READERS[name] for name in _OF_TEXT]
+        fitting = [reader for reader in texts if inner in reader.suffixes]
+        if suffix in text.COMPRESSED and fitting:
+            met = (reader for reader in fitting if reader.recognises and reader.recognises(path))
+            return next(met, fitting[-1])
         raise FileFormatError(
             f"{path} is compressed or an archive, which is read of text alone ("
             f"{', '.join(f'.csv{s}' for s in text.COMPRESSED)}); unpack it with: {PACKED[suffix]}"
@@ -357,6 +391,8 @@ def reader_of(path: Path) -> Reader:
             f"{path} is a folder of no known format, expected one of: {known}; name the file "
             "inside it, or its format with format="
         )
+    if suffix in CONVERTED:
+        raise FileFormatError(f"{path} is {CONVERTED[suffix]}")
     if not fitting:
         named = (
             f"{reader.name} ({', '.join(sorted(reader.suffixes))})" for reader in READERS.values()
@@ -379,13 +415,27 @@ register_reader(
 register_reader("parquet", parquet.read_parquet, suffixes=(".parquet", ".pq"))
 register_reader("euroc", pose.read_euroc, suffixes=(".csv", FOLDER), recognises=pose.is_euroc)
 register_reader("tum", pose.read_tum, suffixes=(".tum", ".txt"), recognises=pose.is_tum)
+register_reader(
+    "ardupilot",
+    ardupilot.recordings,
+    suffixes=(".log", ".txt", ".csv"),
+    recognises=ardupilot.recognises,
+)
 register_reader("csv", table.read_csv, suffixes=(".csv", ".tsv", ".txt"))
-register_reader("npz", npz.read_npz, suffixes=(".npz",))
+register_reader("npz", npz.read_npz, suffixes=(".npz", ".npy"))
+register_reader("mat", mat.read_mat, suffixes=(".mat",), recognises=mat.recognises)
+register_reader("feather", parquet.read_feather, suffixes=(".feather", ".arrow", ".ipc", ".arrows"))
 register_reader(
     "lerobot",
     lerobot.recordings,
     suffixes=(".parquet", ".json", FOLDER),
     recognises=lerobot.recognises,
+)
+register_reader(
+    "json",
+    json_lines.read_json_lines,
+    suffixes=(".jsonl", ".ndjson", ".json"),
+    recognises=json_lines.recognises,
 )
 register_reader("ros", ros.recordings, suffixes=(*ros.SUFFIXES, FOLDER), recognises=ros.recognises)
 register_reader("ulog", ulog.recordings, suffixes=ulog.SUFFIXES)

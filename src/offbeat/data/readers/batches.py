@@ -174,7 +174,7 @@ def clock_of_columns(
     if is_text(kind):
         stamps = [stamps_of(pc.utf8_trim_whitespace(_text(c)), form or "without") for c in chunks]
         clock = np.concatenate([clock_of(c) for c in stamps])
-        return over_midnight(clock) if form == "of day" else clock
+        return over_midnight(clock, form)
     if pa.types.is_date(kind):
         chunks = [c.cast(pa.timestamp("ns")) for c in chunks]
     if pa.types.is_time(kind):
@@ -189,7 +189,8 @@ def is_text(kind: Any) -> bool:
 
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
+    texts = (pa.types.is_string, pa.types.is_large_string, pa.types.is_string_view)
+    return any(fits(kind) for fits in texts)
 
 
 def _known(chunks: Iterable[Any], name: str) -> Iterator[Any]:

@@ -19,13 +19,14 @@ from offbeat.data.cleaning.clocks import (
     TIME_NAMES,
     folded,
     is_rest,
+    may_be_time,
     split_stamps,
     split_unit,
     time_column_of,
 )
 from offbeat.data.cleaning.options import is_number
 from offbeat.data.readers.options import names as names_of
-from offbeat.data.readers.stamps import form_of
+from offbeat.data.readers.stamps import form_of, is_date
 from offbeat.errors import FileFormatError, InputError, NoLogError, listed, one_of
 
 LABEL_NAMES = (
@@ -74,6 +75,7 @@ class TableOptions:
     value_column: str | None = None
     instance_column: str | None = None
     rate_hz: float | None = None
+    day_first: bool | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", names_of("channels", self.channels))
@@ -349,6 +351,21 @@ def stamp_columns(
         return made(time)
     if len(pairs) == 1:
         return joined(*pairs[0])
+    likely = [
+        name
+        for name in names
+        if may_be_time(name)
+        and (_increases(sample.numbers(name)) or form_of(_first(sample.texts(name))) is not None)
+    ]
+    if not pairs and len(likely) == 1:
+        return made(likely[0], note=f"{likely[0]!r} is taken for the time: it alone is named like "
+                    "one, and increases")  # fmt: skip
+    parts = [name for name in names if folded(name) in (*_DATE_PARTS, *_MINUTES)]
+    if len(parts) > 2 and not pairs:
+        raise FileFormatError(
+            f"{path} has the time in several columns, {listed(parts, 6, quoted=True)}; join them "
+            "in one column, such as 2026-11-24T21:00:00, or give rate_hz="
+        )
     if pairs:
         shown = ", ".join(f"[{one}, {two}]" for one, two, _ in pairs)
         raise FileFormatError(
@@ -363,6 +380,7 @@ def stamp_columns(
 
 _DATES = ("date", "day", "date_utc", "utc_date", "local_date", "datum")
 _SECONDS = ("s", "sec", "secs", "second", "seconds")
+_DATE_PARTS = ("year", "month", "day", "doy", "yyyy", "mm", "dd")
 _MINUTES = ("minute", "minutes", "hour", "hours")  # min is a minimum
 
 
@@ -377,14 +395,19 @@ def _refuse_dates(
         if usual and sample.is_text(name) and not _is_date(sample, name):
             raise FileFormatError(
                 f"{path} has dates such as {_first(sample.texts(name))[:40]!r} in column {name!r}, "
-                "expected 2026-11-24, 2026/11/24 or 24.11.2026; leave them out with "
+                "expected a form such as 2026-11-24; leave them out with "
                 f"without=[{name}]"
             )
 
 
+def _increases(numbers: NDArray[np.float64]) -> bool:
+    steps = np.diff(numbers[np.isfinite(numbers)])
+    return len(steps) > 1 and bool((steps >= 0).all()) and bool((steps > 0).any())
+
+
 def _is_date(sample: Sample, name: str) -> bool:
     text = _first(sample.texts(name))
-    return bool(text) and form_of(text) in ("with", "without")
+    return bool(text) and is_date(form_of(text))
 
 
 def _first(texts: Sequence[str]) -> str:
@@ -412,6 +435,13 @@ def _of_answers(columns: Sequence[str]) -> set[str]:
     known = set(columns)
     parts = {column: column.rpartition("|") for column in columns}
     return {c for c, (name, _, what) in parts.items() if name in known and what in _BESIDE}
+
+
+def unit_written(header: Sequence[str], time: str) -> str | None:
+    """The unit of times in a table of answers of Offbeat, which counts seconds; else None."""
+    clock = header[2:3] and header[2].startswith("clock_")
+    ours = list(header[:2]) == ["trajectory", "time"] and (clock or _of_answers(header))
+    return "s" if ours and time == "time" else None
 
 
 def _named(name: str, columns: list[str], what: str) -> str:

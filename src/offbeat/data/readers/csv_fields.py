@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from offbeat.data.cleaning.clocks import is_unit
 from offbeat.data.readers.columns import Columns
 
 MISSING = (
@@ -32,6 +33,28 @@ GROUPED_BY_POINTS = re.compile(r"[+-]?[1-9][0-9]{0,2}(\.[0-9]{3})+,[0-9]+")
 """Numbers with a decimal comma, and a point for each thousand."""
 
 _GROUPED_BY_COMMAS = re.compile(_THOUSANDS)
+
+
+_CELL = re.compile(r"[+-]?[0-9.][0-9.,]*(?:[eE][+-]?[0-9]+)?(\s*)([^\s0-9.,][^0-9,]{0,11})")
+_CLOSE = frozenset("sVA%°mNWKghC")  # units of one letter that may follow a number without a blank
+
+
+def unit_of_fields(fields: Iterable[str]) -> str:
+    """The unit that follows each of the numbers of a column, as in `12.5 V`; empty if none does."""
+    found = set()
+    for text in fields:
+        match = _CELL.fullmatch(text)
+        if match is None or not is_unit(match[2]):
+            return ""
+        if not match[1] and len(match[2]) == 1 and match[2] not in _CLOSE:
+            return ""
+        found.add(match[2])
+    return found.pop() if len(found) == 1 else ""
+
+
+def without_unit(text: str, unit: str) -> str:
+    """A field without the unit after its number."""
+    return text.removesuffix(unit).rstrip() if unit else text
 
 
 def number_in(text: str, decimal: str) -> float | None:

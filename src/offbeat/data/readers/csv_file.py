@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import NANOSECONDS_PER, time_column_of
+from offbeat.data.cleaning.clocks import NANOSECONDS_PER, split_unit, time_column_of
 from offbeat.data.memory import require_rows
 from offbeat.data.readers.batches import NullValueError, gather, line_error, with_joined
 from offbeat.data.readers.columns import Columns
@@ -24,11 +24,27 @@ from offbeat.data.readers.csv_fields import (
     SWITCHES,
     Converter,
     number_in,
+    unit_of_fields,
+    without_unit,
 )
 from offbeat.data.readers.csv_layout import CsvLayout, is_comment
-from offbeat.data.readers.csv_streams import Spaced, Without, with_count, with_dates, without_empty
+from offbeat.data.readers.csv_streams import (
+    Spaced,
+    Without,
+    with_count,
+    with_dates,
+    without_empty,
+    without_units,
+)
 from offbeat.data.readers.gathered import Coded, Gathered
-from offbeat.data.readers.stamps import expected_after, form_of, over_midnight, with_stamps
+from offbeat.data.readers.stamps import (
+    expected_after,
+    fits_form,
+    form_in,
+    form_of,
+    over_midnight,
+    with_stamps,
+)
 from offbeat.data.readers.text import DAMAGE, TextFile, no_text
 from offbeat.errors import FileFormatError, InputError, NoLogError, listed
 
@@ -72,7 +88,7 @@ class CsvSample:
 
     def form_of(self, name: str) -> str | None:
         """The form of times as text, by the first one."""
-        return form_of(next((f for f in self.texts(name) if f), ""))
+        return form_in(self.texts(name), self.file.day_first)
 
 
 @dataclass(frozen=True)
@@ -89,6 +105,8 @@ class CsvFile:
         odd: rows with another number of fields.
         tail: the last bytes.
         repeated: lines of a header, and of units below it, that stand in the middle, too.
+        day_first: of dates such as 07/08/2026, whether the day is before the month, or None.
+        units: of columns whose fields have one after each number.
     """
 
     text: TextFile
@@ -100,6 +118,8 @@ class CsvFile:
     odd: list[str] = field(default_factory=list)
     tail: list[bytes] = field(default_factory=lambda: [b""])
     repeated: tuple[str, ...] = ()
+    day_first: bool | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def path(self) -> Path:
@@ -151,9 +171,26 @@ class CsvFile:
         """The fields of the first lines."""
         whole = [fields for _, fields in self._first() if len(fields) == len(header)]
         columns = zip(*whole, strict=True) if whole else [()] * len(header)
-        return CsvSample(
-            {n: [f.strip() for f in c] for n, c in zip(header, columns, strict=True)}, self
-        )
+        fields = {
+            n: [without_unit(f.strip(), self.units.get(n, "")) for f in c]
+            for n, c in zip(header, columns, strict=True)
+        }
+        return CsvSample(fields, self)
+
+    def with_units(self, header: list[str]) -> tuple[CsvFile, list[str]]:
+        """The file with the units in its fields, and the header with them in brackets."""
+        sample = self.sample(header)
+        found: dict[str, str] = {}
+        names = list(header)
+        for i, name in enumerate(header):
+            known = [f for f in sample.fields[name] if f not in self.missing]
+            unit = unit_of_fields(known) if name and known and sample.is_text(name) else ""
+            if unit:
+                names[i] = name if split_unit(name)[1] else f"{name} [{unit}]"
+                found[names[i]] = unit
+        if found:
+            self.notes.append(f"numbers have a unit in each field: {listed([*found], quoted=True)}")
+        return replace(self, units=found), names
 
     def decimal_of(self, sample: CsvSample) -> tuple[str, list[str]]:
         """The decimal separator of the first lines, and a note where it is the comma.
@@ -251,8 +288,8 @@ class CsvFile:
             if not len(table.clock):
                 raise NoLogError(f"{self.path} has a header and no rows, expected one per time")
             columns, table = self._usable(header, sample, columns, table, converter)
-            if form == "of day":
-                table = _replaced(table, over_midnight(table.clock))
+            if form is not None:
+                table = _replaced(table, over_midnight(table.clock, form))
             return columns, table, "ns" if pa.types.is_decimal(clock) else unit
         raise AssertionError("the last attempt raises or returns")
 
@@ -294,9 +331,11 @@ class CsvFile:
         return [(clock, False), *(a for a in attempts if not a[1] and a[0] != clock)]
 
     def _batches(self, header: list[str], columns: Columns, types: dict[str, Any]) -> Iterator[Any]:
+        import pyarrow as pa
         import pyarrow.csv as pv
 
         self.odd.clear()
+        read_as = types | {name: pa.string() for name in self.units if name in types}
         nothing = [*self.missing, *(" " * n for n in range(1, 33))]
         delimiter = self.layout.delimiter
         with (
@@ -315,7 +354,7 @@ class CsvFile:
                     invalid_row_handler=self._on_odd_row,
                 ),
                 convert_options=pv.ConvertOptions(
-                    column_types=types,
+                    column_types=read_as,
                     include_columns=columns.read,
                     null_values=nothing,
                     strings_can_be_null=False,
@@ -324,7 +363,8 @@ class CsvFile:
             ) as reader,
         ):
             for batch in reader:
-                yield without_empty(batch) if columns.time else batch
+                kept = without_empty(batch) if columns.time else batch
+                yield without_units(kept, self.units, types, nothing, self.decimal or ".")
 
     def _stream(self) -> Any:
         file = self.text.bytes_from(self.layout.first)
@@ -419,6 +459,8 @@ class CsvFile:
         known = [f for f in sample.fields[name] if f and f not in self.missing]
         if known and all(f in BOOLEANS for f in known):
             expected = f"one of {', '.join(BOOLEANS)}"
+        elif name in self.units:
+            expected = f"a number and {self.units[name]}, as in the rows before"
         elif comma:
             expected = "a number; if its comma is a decimal point, say so with decimal=','"
         else:
@@ -487,12 +529,12 @@ class CsvFile:
     def _explain(self, header: list[str], columns: Columns, sample: CsvSample) -> None:
         """Raises an error that names the invalid line and column of times, if found."""
         first = next((f for f in sample.fields.get(columns.time, []) if f not in self.missing), "")
-        form = form_of(first)
+        form = form_in(sample.texts(columns.time), self.day_first) if columns.time else None
         for line, fields in self._rows():
             if len(fields) != len(header):
                 raise self._wrong_count(line, len(fields), header)
             for name, got in zip(header, fields, strict=True):
-                text = got.strip()
+                text = without_unit(got.strip(), self.units.get(name, ""))
                 if not name or name not in (columns.time, columns.rest):
                     continue
                 if not text or text in self.missing:
@@ -506,7 +548,7 @@ class CsvFile:
                     fits = form_of(text) is not None if form else number is not None
                     expected = "" if fits else "a part of a time, as in the rows before"
                 else:
-                    fits = number is not None if form is None else form_of(text) == form
+                    fits = number is not None if form is None else fits_form(text, form)
                     expected = "" if fits else expected_after(first)
                 if expected:
                     raise FileFormatError(

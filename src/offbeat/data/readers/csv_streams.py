@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,31 @@ def with_dates(batches: Iterator[Any], columns: Columns, form: str) -> Iterator[
     for batch in batches:
         stamps = date_and_time(batch.column(columns.time), batch.column(columns.rest), form)
         yield batch.set_column(batch.schema.get_field_index(columns.time), columns.time, stamps)
+
+
+def without_units(
+    batch: Any,
+    units: Mapping[str, str],
+    types: Mapping[str, Any],
+    missing: Sequence[str],
+    decimal: str,
+) -> Any:
+    """A batch whose texts with a unit after each number are of their types, without it."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    nothing = pa.array(missing)
+    for name, unit in units.items():
+        at = batch.schema.get_field_index(name)
+        if at < 0:
+            continue
+        texts = pc.utf8_trim_whitespace(batch.column(at))
+        texts = pc.replace_substring_regex(texts, rf"\s*{re.escape(unit)}$", "")
+        if not pa.types.is_string(types[name]):
+            texts = pc.replace_substring(texts, decimal, ".")
+            texts = pc.if_else(pc.is_in(texts, nothing), pa.scalar(None, pa.string()), texts)
+        batch = batch.set_column(at, name, texts.cast(types[name]))
+    return batch
 
 
 def with_count(batches: Iterator[Any], rate_hz: float) -> Iterator[Any]:

@@ -11,15 +11,11 @@ Only arrays of numbers are read; pickled data are refused.
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import json
 import math
-import mmap
 import re
-import struct
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,22 +33,29 @@ from offbeat.data.cleaning.clocks import (
 )
 from offbeat.data.cleaning.odd_clocks import without_wraps
 from offbeat.data.cleaning.options import is_number
-from offbeat.data.memory import require_memory
 from offbeat.data.readers.columns import columns_in
+from offbeat.data.readers.hdf5_file import (
+    check_storage,
+    leaves_of,
+    member,
+    opened,
+    refuse_objects,
+    superblock_at,
+    texts_in,
+    what_is,
+)
+from offbeat.data.readers.hdf5_plain import plain_recordings
 from offbeat.data.readers.options import names
 from offbeat.data.signals import Recording, Signal
-from offbeat.data.source import require_file, starts_with
-from offbeat.errors import FileFormatError, InputError, OffbeatError, listed, one_of, require
+from offbeat.data.source import require_file
+from offbeat.errors import FileFormatError, InputError, listed, one_of, require
 
-SUFFIXES = (".hdf5", ".h5", ".hdf")
+SUFFIXES = (".hdf5", ".h5", ".hdf", ".mat")
 
 WIDEST = 1024
 """Arrays with at least this many numbers per row are treated as images or maps, and left out."""
 
-_MAGIC = b"\x89HDF\r\n\x1a\n"
-_DEEPEST = 30  # groups in groups
 _MOST_ARRAYS = 10_000
-_SMALL, _RATIO = 1 << 26, 2000  # bytes of an array that need no check; the most of compression
 _EPISODE = re.compile(r"(?:demo|episode)_(\d+)")
 _MAIN = ("data/main_data.hdf5", "main_data.hdf5")
 
@@ -61,7 +64,7 @@ def recognises(path: Path) -> bool:
     """Whether a file has the signature of HDF5, or a folder is a data set of Minari."""
     if path.is_dir():
         return any((path / name).is_file() for name in _MAIN)
-    return starts_with(path, _MAGIC)
+    return superblock_at(path) is not None
 
 
 def recordings(
@@ -113,19 +116,19 @@ def recordings(
             raise FileFormatError(f"{path} holds no {_MAIN[0]}, expected a data set of Minari")
         path = inside[0]
     path = require_file(path)
-    with _opened(path) as file:
+    with opened(path) as file:
         robomimic = "data" in file and any(map(_EPISODE.fullmatch, file["data"]))
         root = file["data"] if robomimic else file
         episodes = sorted(
             (name for name in root if _EPISODE.fullmatch(name)),
             key=lambda name: int(name.rpartition("_")[2]),
         )
-        if not episodes:
-            raise FileFormatError(
-                f"{path} is laid out neither like robomimic (data/demo_0/obs) nor like Minari "
-                "(episode_0/observations); it holds: "
-                f"{listed(sorted(file)) or 'nothing'}"
-            )
+        if mask is None and (not episodes or not (robomimic or _are_learned(root, episodes))):
+            yield from plain_recordings(
+                file, path, keys=keys, include_actions=include_actions, rate_hz=rate_hz,
+                time_column=time_column, time_unit=time_unit,
+            )  # fmt: skip
+            return
         if mask is not None:
             episodes = _masked(file, mask, episodes, path)
         rate, notes = _rate(root, path, rate_hz, robomimic=robomimic)
@@ -149,57 +152,12 @@ def recordings(
             yield made
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Opens the file; converts errors of HDF5 to one line."""
-    import h5py
-
-    with suppress(ImportError):
-        importlib.import_module("hdf5plugin")  # registers filters, where it is installed
-    _check_heaps(path)
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except OffbeatError:
-        raise
-    except Exception as error:  # of h5py about damaged files: of any kind
-        what = " ".join(str(error).split())[:120]
-        raise FileFormatError(
-            f"{path} can't be read as HDF5, it is truncated, damaged or of another format "
-            f"({what}); copy it again"
-        ) from None
-
-
 _TIMED = ("stamps are the array", "stamps are joined")  # notes of episodes that have times
-_HEAP = b"GCOL\1\0\0\0"
-"""Begin of a global heap, which holds texts of any length; lengths and objects follow."""
 
 
-def _check_heaps(path: Path) -> None:
-    """Refuses a global heap with a free space of 0 bytes, in which HDF5 would loop for ever.
-
-    Raises:
-        FileFormatError: the file has one.
-    """
-    with path.open("rb") as file:
-        if not file.read(1):
-            return
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            start = data.find(_HEAP)
-            while start >= 0 and start + 16 <= len(data):
-                end = min(start + struct.unpack_from("<Q", data, start + 8)[0], len(data))
-                at, size = start + 16, 1
-                while at + 16 <= end and size:
-                    index, _, size = struct.unpack_from("<HH4xQ", data, at)
-                    if index:
-                        size = 16 + -(-size // 8) * 8
-                    at += size
-                if not size:
-                    raise FileFormatError(
-                        f"{path} is damaged: a heap of its texts has a free space of 0 bytes, at "
-                        f"byte {at}; copy it again"
-                    )
-                start = data.find(_HEAP, start + 8)
+def _are_learned(root: Any, episodes: list[str]) -> bool:
+    """Whether groups are episodes of Minari, which have observations or actions."""
+    return any("observations" in root[name] or "actions" in root[name] for name in episodes[:2])
 
 
 def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:
@@ -207,7 +165,7 @@ def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:
     if not masks:
         raise InputError(f"{path} has no masks, leave mask out")
     listed = file["mask"][one_of(f"mask of {path.name}", mask, masks)]
-    _check_storage(listed, path)
+    check_storage(listed, path)
     if listed.dtype.kind not in "SO":
         raise FileFormatError(f"{path}: the mask {mask!r} holds {listed.dtype}, expected names")
     chosen = {text.decode() if isinstance(text, bytes) else str(text) for text in listed[()]}
@@ -266,7 +224,7 @@ def _episode(
     time_unit: str | None,
     given_rate: bool,
 ) -> Recording:
-    leaves = dict(itertools.islice(_leaves(observations, "", path), _MOST_ARRAYS))
+    leaves = dict(itertools.islice(leaves_of(observations, "", path), _MOST_ARRAYS))
     times = {} if given_rate else _times(episode, leaves, path, time_column)
     if keys is not None:
         known = {name for leaf in leaves for name in _prefixes(leaf)}
@@ -285,16 +243,16 @@ def _episode(
             continue
         if name in times and not chosen:
             continue
-        _refuse_objects(dataset, path)
+        refuse_objects(dataset, path)
         width = math.prod(dataset.shape[1:]) if dataset.shape else 0
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
-            left.append(f"{name} ({_what(dataset)})")
+            left.append(f"{name} ({what_is(dataset)})")
         elif not chosen and (width > WIDEST or dataset.ndim > 3):
             left.append(f"{name} ({' x '.join(map(str, dataset.shape[1:]))})")
         elif width == 1 and not chosen and (name in in_pairs or time_column_of([name])):
             left.append(f"{name} (a time)")
         elif width:
-            _check_storage(dataset, path)
+            check_storage(dataset, path)
             arrays[name] = np.asarray(dataset[()], dtype=np.float64).reshape(len(dataset), width)
     if not arrays:
         raise FileFormatError(
@@ -384,7 +342,7 @@ def _times(
         name: array
         for group in (episode, episode.get("infos", ()))
         for name in (group if isinstance(group, h5py.Group) else ())
-        if isinstance(array := _member(group, name, path), h5py.Dataset)
+        if isinstance(array := member(group, name, path), h5py.Dataset)
     }
     known = {**beside, **leaves}
     usual = [name for name, array in known.items() if array.shape[1:] in ((), (1,)) and array.ndim]
@@ -446,7 +404,7 @@ def _pairs(arrays: Mapping[str, Any], path: Path) -> list[tuple[str, str]]:
         both = arrays[one], arrays[two]
         if all(array.dtype.kind in "iuf" for array in both):
             for array in both:
-                _check_storage(array, path)
+                check_storage(array, path)
             whole, rest = (array[()].reshape(-1) for array in both)
             if is_rest(whole, rest, unit):
                 found.append((one, two))
@@ -458,7 +416,7 @@ def _clock(
 ) -> tuple[tuple[str, NDArray[Any]], str | None]:
     """The name and the numbers of a clock, and their unit where it is known."""
     for array in times.values():
-        _check_storage(array, path)
+        check_storage(array, path)
     first, *rest = times
     if not rest:
         stated = times[first].attrs.get("units", times[first].attrs.get("unit", ""))
@@ -471,101 +429,15 @@ def _clock(
     return (first, join_stamp(whole, left, of_rest)), "ns"
 
 
-def _leaves(node: Any, path: str, file: Path, depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """The arrays below a group, or the array itself, by path. Tuple elements are numbered.
-
-    Raises:
-        FileFormatError: groups are nested too deeply, or a link leaves the file.
-    """
-    import h5py
-
-    if isinstance(node, h5py.Dataset):
-        yield path, node
-        return
-    if depth > _DEEPEST:
-        raise FileFormatError(f"{file} nests groups more than {_DEEPEST} deep, at {node.name[:60]}")
-    for name in node:
-        here = name.removeprefix("_index_")
-        inner = _member(node, name, file)
-        yield from _leaves(inner, f"{path}/{here}" if path else here, file, depth + 1)
-
-
-def _member(group: Any, name: str, file: Path) -> Any:
-    """A member of a group, unless its link leads to another file."""
-    import h5py
-
-    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
-        raise FileFormatError(
-            f"{file}: {group.name}/{name} is a link to another file, expected data inside; copy "
-            "them into one file"
-        )
-    return group[name]
-
-
-def _check_storage(dataset: Any, path: Path) -> None:
-    """Checks that an array is stored in the file, in a form that can be read, and fits memory.
-
-    Raises:
-        FileFormatError: it is in another file, compressed with a filter that is not installed, or
-            far larger than what is stored.
-    """
-    import h5py
-
-    if dataset.external or dataset.is_virtual:
-        raise FileFormatError(
-            f"{path}: {dataset.name} is stored in another file, expected data inside; copy them "
-            "into one file"
-        )
-    created = dataset.id.get_create_plist()
-    for i in range(created.get_nfilters()):
-        code, _, _, name = created.get_filter(i)
-        if not h5py.h5z.filter_avail(code):
-            called = name.decode(errors="replace") or code
-            raise FileFormatError(
-                f"{path}: {dataset.name} is compressed with the filter {called!r}, which is not "
-                "installed; install it with: pip install hdf5plugin"
-            )
-    need = math.prod(dataset.shape) * max(dataset.dtype.itemsize, 8)
-    if need > _SMALL and need > _RATIO * path.stat().st_size:
-        raise FileFormatError(
-            f"{path}: {dataset.name} has shape {dataset.shape}, far more than the file of "
-            f"{path.stat().st_size} bytes holds; copy it again"
-        )
-    require_memory(path, need, f"an array of shape {dataset.shape} in {dataset.name}")
-
-
 def _prefixes(path: str) -> Iterator[str]:
     parts = path.split("/")
     for i in range(len(parts)):
         yield "/".join(parts[: i + 1])
 
 
-def _refuse_objects(dataset: Any, path: Path) -> None:
-    """Raises an error for pickled data: opaque bytes, and objects of PyTables."""
-    kind = dataset.dtype
-    if (kind.kind == "V" and kind.names is None) or "PSEUDOATOM" in dataset.attrs:
-        raise FileFormatError(
-            f"{path}: {dataset.name} holds objects ({kind}), which would have to be unpickled, and "
-            "that can run any code; Offbeat never does; write numbers, or choose others with keys="
-        )
-
-
-def _what(dataset: Any) -> str:
-    """The kind of a non-numeric array, for messages."""
-    import h5py
-
-    if dataset.dtype.kind in "SU" or h5py.check_string_dtype(dataset.dtype) is not None:
-        return "text"
-    if dataset.dtype.names is not None:
-        return "records"
-    if h5py.check_vlen_dtype(dataset.dtype) is not None:
-        return "lists"
-    return str(dataset.dtype) if dataset.ndim else "one number"
-
-
 def _names(name: str, width: int, array: Any) -> list[str]:
     """The names of an array's columns: those in its attribute `names`, else numbers."""
-    given = _attribute(array, "names", width)
+    given = texts_in(array, "names", width)
     if given is not None and len(set(given)) == width and all(given):
         return given
     if not name:  # all observations are one array
@@ -575,17 +447,7 @@ def _names(name: str, width: int, array: Any) -> list[str]:
 
 def _units(array: Any, width: int) -> list[str]:
     """The units of an array's columns, in its attribute `units`; else empty."""
-    return _attribute(array, "units", width) or [""] * width
-
-
-def _attribute(array: Any, name: str, width: int) -> list[str] | None:
-    """A text per column in an attribute, or None."""
-    try:
-        found = np.asarray(array.attrs[name]).reshape(-1)
-    except (KeyError, OSError, TypeError, ValueError):
-        return None
-    texts = [text.decode(errors="replace") if isinstance(text, bytes) else text for text in found]
-    return texts if len(texts) == width and all(isinstance(t, str) for t in texts) else None
+    return texts_in(array, "units", width) or [""] * width
 
 
 def _kinds(name: str, channels: list[str]) -> list[str]:
@@ -602,15 +464,15 @@ def _actions(
     parts: list[NDArray[np.float64]] = []
     channels: list[str] = []
     units: list[str] = []
-    for name, dataset in _leaves(_member(episode, "actions", path), "", path):
-        _refuse_objects(dataset, path)
-        _check_storage(dataset, path)
+    for name, dataset in leaves_of(member(episode, "actions", path), "", path):
+        refuse_objects(dataset, path)
+        check_storage(dataset, path)
         if dataset.dtype.kind not in "biuf" or not dataset.ndim:
-            return [], [], [], (f"actions are left out, they hold {_what(dataset)}",)
+            return [], [], [], (f"actions are left out, they hold {what_is(dataset)}",)
         values = np.asarray(dataset[()], dtype=np.float64)
         parts.append(values.reshape(len(values), math.prod(values.shape[1:])))
         start, width = f"action.{name}" if name else "action", parts[-1].shape[1]
-        given = _attribute(dataset, "names", width)
+        given = texts_in(dataset, "names", width)
         channels += given or [f"{start}[{i}]" for i in range(width)]
         units += _units(dataset, width)
     if not parts or len({len(part) for part in parts}) > 1 or len(parts[0]) not in (rows, rows - 1):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from offbeat.data.cleaning.clocks import state_time_unit
-from offbeat.data.readers.columns import Columns, TableOptions
+from offbeat.data.readers.columns import Columns, TableOptions, unit_written
 from offbeat.data.readers.csv_fields import MISSING
 from offbeat.data.readers.csv_file import CsvFile, CsvSample
 from offbeat.data.readers.csv_layout import find_csv_layout
@@ -36,6 +37,7 @@ def read_csv(
     missing: Sequence[str | float] = (),
     column_names: Sequence[str] | None = None,
     rate_hz: float | None = None,
+    day_first: bool | None = None,
 ) -> list[Recording]:
     """Reads recordings from CSV: a header, then one row per time, or one per measured value.
 
@@ -76,6 +78,8 @@ def read_csv(
         missing: more fields whose value is not known, such as `-999` or `lost`.
         column_names: names of the columns of a file without a header.
         rate_hz: rows per second, for a file without times.
+        day_first: of dates such as 07/08/2026, whether the day is before the month; by default
+            decided by a number above 12 in the first rows, else asked for.
 
     Returns:
         A recording per trajectory, in the order of their first rows; a field that is empty, or
@@ -108,16 +112,18 @@ def read_csv(
         value_column=value_column,
         instance_column=instance_column,
         rate_hz=rate_hz,
+        day_first=day_first,
     )
     text = TextFile.of(require_file(path))
     layout = find_csv_layout(text, delimiter, column_names)
-    file = CsvFile(text, layout, decimal, (*MISSING, *map(str, missing)))
+    file = CsvFile(text, layout, decimal, (*MISSING, *map(str, missing)), day_first=day_first)
     header, noted = file.header()
     notes = [*noted]
+    file, header = file.with_units(header)
     sample = file.sample(header)
     if decimal is None:
         decimal, more = file.decimal_of(sample)
-        file = CsvFile(text, layout, decimal or ".", file.missing, thousands=bool(decimal))
+        file = replace(file, decimal=decimal or ".", thousands=bool(decimal))
         sample = CsvSample(sample.fields, file)
         notes += more
     named = [name for name in header if name]
@@ -130,6 +136,7 @@ def read_csv(
     if columns.rest or not columns.time or sample.form_of(columns.time):
         unit, found = "ns", False
     else:
+        time_unit = time_unit or unit_written(header, columns.time)
         stated = state_time_unit(
             time_unit, columns.time, sample.numbers(columns.time), str(text.path)
         )

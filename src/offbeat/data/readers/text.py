@@ -56,7 +56,7 @@ class TextFile:
 
     @classmethod
     def of(cls, path: Path) -> TextFile:
-        """The file with its encoding: UTF-8, UTF-16 with a byte order mark, else Windows-1252.
+        """The file with its encoding: UTF-8, UTF-16, with a mark or plain, else Windows-1252.
 
         Raises:
             FileFormatError: it can't be decompressed, or is no text.
@@ -72,6 +72,9 @@ class TextFile:
                 if "\0" in text or "\ufeff" in text[1:] or "\ufffd" in text[:-1]:
                     raise no_text(path, f"it is no {encoding}")
                 return cls(path, encoding)
+        for encoding, place in (("utf-16-le", 1), ("utf-16-be", 0)):
+            if len(start) > 8 and not any(start[place:256:2]) and all(start[1 - place : 256 : 2]):
+                return cls(path, encoding, (f"the text is taken for {encoding} without a mark",))
         at = start.find(b"\0")
         if at >= 0 and (start.count(b"\n", 0, at) < 2 or start[at : at + 8].strip(b"\0")):
             raise no_text(path, "it holds bytes of 0")
@@ -163,6 +166,17 @@ class TextFile:
                 f"{self.path} can't be read as CSV ({error}); it must be text in UTF-8 with a row "
                 "per line"
             ) from None
+
+
+def start_of(path: Path) -> bytes:
+    """The first bytes of a file, decompressed; empty if it can't be read."""
+    try:
+        if not path.is_file():  # a pipe or a device may never end
+            return b""
+        with _opened(path, []) as file:
+            return file.read(_START)
+    except DAMAGE:
+        return b""
 
 
 def no_text(path: Path, why: object) -> FileFormatError:

@@ -115,7 +115,7 @@ def save(dataset: Dataset, path: str | Path, *, format: str | None = None, **opt
     | `minari` | a folder, by name | `level` |
 
     `.csv` and `table` (plain Parquet) are tables: a row per time, and the columns `trajectory`,
-    `time` and one per channel, called `name [unit]`. They have no masks, roles and meta; values
+    `time [s]` and one per channel, called `name [unit]`. They have no masks, roles and meta; values
     that are not observed are written all the same.
 
     Args:

@@ -14,6 +14,8 @@ from offbeat.data.trajectory import Dataset
 from offbeat.errors import InputError, one_of
 from offbeat.files import atomic_path
 
+_TIME = "time [s]"  # with its unit, which a reader would else find from the numbers
+
 
 def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
     """Writes columns as CSV or Parquet by the suffix of `path`, atomically.
@@ -51,7 +53,7 @@ def write_table(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:
 
 
 def write_dataset(dataset: Dataset, path: str | Path) -> None:
-    """Writes a data set as a table: a row per time, columns `trajectory`, `time`, and channels.
+    """Writes a data set as a table: a row per time, columns `trajectory`, `time [s]`, and channels.
 
     `trajectory` is the label of the trajectory where it has one, else its number. A channel's unit
     follows its name in brackets.
@@ -68,7 +70,7 @@ def write_dataset(dataset: Dataset, path: str | Path) -> None:
         for name, unit in zip(dataset.names, dataset.units, strict=True)
     ]
     for i, name in enumerate(named):
-        if name in ("trajectory", "time", *named[:i]):
+        if name in ("trajectory", "time", _TIME, *named[:i]):
             raise InputError(f"two columns would have the name {name!r}; rename the channel")
     labels = dataset.meta.get("labels", ())
     if len(labels) != len(dataset) or len(set(labels)) < len(labels):
@@ -76,7 +78,7 @@ def write_dataset(dataset: Dataset, path: str | Path) -> None:
     values = np.concatenate([t.values for t in dataset])
     columns: dict[str, NDArray[Any]] = {
         "trajectory": np.repeat(np.asarray(labels), [t.rows for t in dataset]),
-        "time": np.concatenate([t.times for t in dataset]),
+        _TIME: np.concatenate([t.times for t in dataset]),
     }
     write_table(path, columns | {name: values[:, c] for c, name in enumerate(named)})
 
