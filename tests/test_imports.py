@@ -40,6 +40,7 @@ STAGES = (
     "ladder",
     "answers",
     "learning",
+    "learning_shards",
     "evaluation",
     "stream",
     "export",

@@ -11,6 +11,7 @@ from model_helpers import small_model
 
 import offbeat as ob
 from offbeat.answers.blend import fit_blend
+from offbeat.answers.scoring import ChannelScores
 from offbeat.data.outliers import mask_outliers
 from offbeat.data.redundant import Redundant, find_redundant, leave_out
 from offbeat.data.transforms import Transforms
@@ -250,3 +251,12 @@ def test_intervals_of_constants_have_no_width_and_those_of_copies_are_those_of_t
         assert (width["mode"] == 0).all()
         assert np.array_equal(width["rate_again"][new], width["rate"][new])
         assert (width["height"][~answer.observed[:, 1]] > 0).all()
+
+
+def test_a_table_of_scores_has_no_row_for_a_channel_without_values():
+    rmse = {"model": (0.5, NAN), "mean": (1.0, NAN)}
+    overall = {"model": 0.5, "mean": 1.0}
+    scores = ChannelScores("fill", ("x", "seq"), ("rad", ""), (5, 0), rmse, overall, ("mean",))
+    _, *lines, last = [line.split() for line in scores.short().splitlines()]
+    assert lines == [["x", "rad", "5", "0.5", "1", "mean", "0.5"]]
+    assert last[-5:] == ["5", "0.5", "1", "mean", "0.5"]

@@ -16,6 +16,7 @@ from offbeat.config import ModelConfig, SplitConfig, TaskConfig, TrainConfig, ch
 from offbeat.data.masking import masked_values
 from offbeat.data.plan import Plan, plan, prepare
 from offbeat.data.scaler import Scaler, ScalerKind
+from offbeat.data.shards import ShardedDataset
 from offbeat.data.splits import apply_split
 from offbeat.data.trajectory import Dataset
 from offbeat.ladder import CANDIDATES, LadderResult, fit_ladder
@@ -150,7 +151,7 @@ def learn(
         )
         train, validation, _ = apply_split(dataset, chosen.whole)
         test = apply_split(dataset, split)[2]
-    tasks = _tasks(chosen, train, horizon_s)
+    tasks = tasks_of(chosen, train, horizon_s)
     blend, fitted, said = train_blend(
         train,
         validation,
@@ -189,6 +190,7 @@ def train_blend(
     seed: int = 0,
     device: str | None = None,
     progress: bool = True,
+    shards: ShardedDataset | None = None,
 ) -> tuple[Blend, FitResult, tuple[str, ...]]:
     """Trains models on parts of a data set, and blends them with baselines.
 
@@ -209,6 +211,7 @@ def train_blend(
         seed: of weights and tasks.
         device: to train on.
         progress: show progress bars.
+        shards: what the model is trained on, where `train` is a sample of it; only as it is.
 
     Returns:
         The blend, the training of the forward model, and sentences on the choice of the model,
@@ -240,8 +243,9 @@ def train_blend(
         config = replace(config, epochs=max(len(fitted.history) // 2, 4), learning_rate=rate)
         said = (_said(result),)
     else:
-        forward = make_model(model or "anchored_ode_gru_d", train, scaler=kind, seed=seed)
-        fitted = fit(forward, train, validation, config, out=folder, **common)
+        whole: Dataset | ShardedDataset = train if shards is None else shards
+        forward = make_model(model or "anchored_ode_gru_d", whole, scaler=kind, seed=seed)
+        fitted = fit(forward, whole, validation, config, out=folder, **common)
     if getattr(getattr(forward, "config", None), "head", None) == "gaussian":
         said = (*said, GAUSSIAN)
     if fitted.diverged:
@@ -303,7 +307,14 @@ def _said(result: LadderResult) -> str:
     )
 
 
-def _tasks(chosen: Plan | None, train: Dataset, horizon_s: float | None) -> TaskConfig:
+def tasks_of(chosen: Plan | None, train: Dataset, horizon_s: float | None) -> TaskConfig:
+    """What will be asked.
+
+    Args:
+        chosen: for the log, or None for a data set as it is.
+        train: training part.
+        horizon_s: s, as of `learn`.
+    """
     if chosen is not None:
         return chosen.tasks
     gap = typical_gap(train)

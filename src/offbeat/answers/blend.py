@@ -257,7 +257,10 @@ class Blend:
         edges = self.stack.keys.bins.edges
         lines = [["gamma: channel", *(f"to {edge:.3g} s" for edge in edges)]]
         usual = self.gamma[self.stack.keys.usual]
+        left_out = set(self.transforms.left_out)
         for c, name in enumerate(self.names):
+            if name in left_out:
+                continue
             lines.append([name, *(f"{g:.2f}" for g in usual[:, c])])
         return plain(lines)
 

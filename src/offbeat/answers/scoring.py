@@ -130,15 +130,17 @@ class ChannelScores:
         }
 
     def short(self) -> str:
-        """A plain-text table with a row per channel: the predictor, and the best baseline."""
+        """A plain-text table: the predictor and the best baseline of each channel with values."""
         (name, *_) = self.rmse
         lines = [["channel", "unit", "values", name, "best baseline", "", "ratio"]]
         each = zip(self.names, self.units, self.counts, strict=True)
         for i, (channel, unit, count) in enumerate(each):
+            if not count:  # such as a constant, which is not learned
+                continue
             own = self.rmse[name][i]
             best, who = min((self.rmse[p][i], p) for p in self.trivial)
             ratio = own / best if best > 0 else float("nan")
-            row = [_shown(own), _shown(best), who if count else "", _shown(ratio)]
+            row = [_shown(own), _shown(best), who, _shown(ratio)]
             lines.append([channel, unit or "-", str(count), *row])
         best, who = min((self.overall[p], p) for p in self.trivial)
         own = self.overall[name]

@@ -24,6 +24,7 @@ def sweep_command(
     processes: int | None = None,
     threads: int = 1,
     device: str = "cpu",
+    together: int | None = None,
     budget_minutes: float | None = None,
     mixed: str = "refuse",
     engine_options: dict[str, str | int | float | bool | None] | None = None,
@@ -52,6 +53,8 @@ def sweep_command(
         processes: runs at a time; by default as many as cores and memory allow.
         threads: of each run.
         device: that models are trained on: cpu, cuda, cuda:1, or auto for a GPU where there is one.
+        together: runs of equal shape that are trained in one process and take their steps at once;
+            by default 32 on a GPU with the triton backend, else 1.
         budget_minutes: stop after so long; the same command continues later.
         mixed: where out has runs of other code, of another processor, backend, torch or data,
             refuse to continue, accept them (the record marks them), or redo them.
@@ -82,6 +85,7 @@ def sweep_command(
         processes=processes,
         threads=threads,
         device=device,
+        together=together,
         budget_minutes=budget_minutes,
         mixed=mixed,
         engine_options=engine_options,

@@ -6,12 +6,21 @@ import sys
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from offbeat.cli.common import FOUND, READER_FILE, plain, read_planned, say
 from offbeat.config import ModelConfig, SplitConfig, TrainConfig, check_seed, from_mapping
 from offbeat.errors import InputError, one_of
 from offbeat.progress import busy
+
+if TYPE_CHECKING:
+    from offbeat.data.shards import ShardedDataset
+
+LARGE = 0.25
+"""Fraction of the available memory beyond which the files of a folder are read one by one."""
+
+TEST_FILE = "test.parquet"
+"""Windows that a run on such a folder was scored on."""
 
 
 def train_command(
@@ -26,6 +35,7 @@ def train_command(
     baselines: list[str] | None = None,
     budget_minutes: float = 4.0,
     reader: dict[str, Any] | None = None,
+    lazy: bool | None = None,
     seed: int = 0,
     threads: int = 1,
     device: str = "cpu",
@@ -59,6 +69,8 @@ def train_command(
             for a data set of Offbeat.
         budget_minutes: time for trainings, baselines and blend, about, where the model is chosen.
         reader: how the log is read; the run keeps these options for the other commands.
+        lazy: read the files of a folder of data sets of Offbeat when they are needed, and never
+            all at once; by default where they need more than a quarter of the available memory.
         seed: of the initial weights.
         threads: of torch; one is fastest for models of this size.
         device: that the model is trained on: cpu, cuda, cuda:1, or auto for a GPU where there is a
@@ -71,10 +83,12 @@ def train_command(
     from offbeat.cli.scored import scored
     from offbeat.data.scaler import SCALERS
     from offbeat.data.splits import save_split
+    from offbeat.data.store import save
     from offbeat.distributed import group, is_first
     from offbeat.evaluation import evaluate
     from offbeat.files import writable, write_json, write_text
     from offbeat.learning import learn
+    from offbeat.learning_shards import learn_shards
     from offbeat.models.zoo import MODELS
     from offbeat.run import locked
 
@@ -96,33 +110,40 @@ def train_command(
     torch.set_num_threads(threads)
     open_split = split == SplitConfig(seed=split.seed)
     given_split = None if open_split else split
-    with busy("reading and inspecting the log"):
-        dataset, chosen = read_planned(
-            data, reader, horizon_s=horizon_s, split=given_split, seed=split.seed
-        )
-    if chosen is not None:
-        reader, split = dict(chosen.reader), chosen.split
-        for note in chosen.notes:
-            print(f"offbeat: {note}", file=sys.stderr)
+    opened = _opened_lazily(data, lazy, two_sided)
+    chosen = dataset = None
+    if opened is None:
+        with busy("reading and inspecting the log"):
+            dataset, chosen = read_planned(
+                data, reader, horizon_s=horizon_s, split=given_split, seed=split.seed
+            )
     as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
     open_model = model == ModelConfig()
     with group(device) as ranks, locked(out) if is_first() else nullcontext():
-        learned = learn(
-            dataset,
-            out if is_first() else None,
-            horizon_s=horizon_s,
-            model=None if open_model and not as_it_is else model,
-            training=config,
-            split=split,
-            chosen=chosen,
-            as_it_is=as_it_is,
-            two_sided=not as_it_is if two_sided is None else two_sided,
-            baselines=baselines,
-            scaler=scaler,  # type: ignore[arg-type]
-            budget_s=60 * budget_minutes,
-            seed=seed,
-            device=device,
-        )
+        common: dict[str, Any] = {
+            "horizon_s": horizon_s,
+            "training": config,
+            "split": split,
+            "baselines": baselines,
+            "scaler": scaler,
+            "seed": seed,
+            "device": device,
+        }
+        folder = out if is_first() else None
+        if opened is not None:
+            learned = learn_shards(opened, folder, model=model, **common)
+        else:
+            assert dataset is not None
+            learned = learn(
+                dataset,
+                folder,
+                model=None if open_model and not as_it_is else model,
+                chosen=chosen,
+                as_it_is=as_it_is,
+                two_sided=not as_it_is if two_sided is None else two_sided,
+                budget_s=60 * budget_minutes,
+                **common,
+            )
         if ranks is not None and not ranks.first:
             return
         for note in learned.notes[len(() if chosen is None else chosen.notes) :]:
@@ -140,13 +161,17 @@ def train_command(
             "two_sided": blend.backward is not None,
             "baselines": [*blend.stack.members, *blend.both.members],
             "reader": reader,
+            "lazy": opened is not None,
             "seed": seed,
             "threads": threads,
             "device": device,
         }
         write_text(out / "config.yaml", yaml.safe_dump(resolved, sort_keys=False))
-        save_split(out / "split.json", learned.split, dataset)
-        if reader or "found" in dataset.meta:
+        if dataset is None:
+            save(learned.test, out / TEST_FILE)
+        else:
+            save_split(out / "split.json", learned.split, dataset)
+        if dataset is not None and (reader or "found" in dataset.meta):
             kept = {**(reader or {}), FOUND: dataset.meta.get("found", {})}
             write_json(out / READER_FILE, kept)
         with busy("scoring the test part"):
@@ -154,7 +179,48 @@ def train_command(
         result = {"steps": learned.fit.steps, "part": "test", **scores}
         write_json(out / "results.json", result)
         heading = f"{out}: {learned.fit.steps} steps; scores of the test part"
+        if dataset is None:
+            heading += f", whose windows are in {out / TEST_FILE}"
         say(result, f"{heading}\n{text}", json)
+
+
+def _opened_lazily(data: Path, lazy: bool | None, two_sided: bool | None) -> ShardedDataset | None:
+    """The folder, if its files are to be read when they are needed; None if all at once.
+
+    Raises:
+        InputError: the former is asked for, and the data is no folder of data sets of Offbeat; or
+            it is so, and a model of reversed trajectories is asked for.
+    """
+    from offbeat.data.memory import available_memory, gigabytes
+    from offbeat.data.shards import ShardedDataset
+    from offbeat.data.store import holds_data_set
+
+    first = next(iter(sorted(data.glob("*.parquet"))), None) if data.is_dir() else None
+    if first is None or not holds_data_set(first):
+        if lazy:
+            raise InputError(
+                "--lazy reads a folder of Parquet files that offbeat.save or save_shards wrote, "
+                f"got {data}; write one from any logs with offbeat.data.shards.save_shards"
+            )
+        return None
+    if lazy is False:
+        return None
+    opened, free = ShardedDataset.open(data), available_memory()
+    if not lazy and (free is None or opened.bytes <= LARGE * free):
+        return None
+    if two_sided:
+        raise InputError(
+            f"--two_sided needs the data in memory, and the files of {data} are read when they are "
+            "needed; leave it out"
+        )
+    why = "" if lazy else f", more than {LARGE:.0%} of the {gigabytes(free or 0)} available"
+    print(
+        f"offbeat: {data}: {len(opened.shards)} files, {opened.rows} rows x {opened.channels} "
+        f"channels, {gigabytes(opened.bytes)} in memory{why}: files are read when they are needed "
+        "(--lazy=false reads all at once)",
+        file=sys.stderr,
+    )
+    return opened
 
 
 def _resolved(made: Any, given: ModelConfig) -> dict[str, Any]:

@@ -27,8 +27,17 @@ def require_rows(
     Raises:
         FileFormatError: it does not fit.
     """
-    need = copies * rows * (channels * _PER_VALUE + _PER_ROW)
+    need = copies * rows * row_bytes(channels)
     require_memory(path, need, f"{rows} rows x {channels} channels", instead)
+
+
+def row_bytes(channels: int) -> int:
+    """Memory of a row of a data set, about, in bytes.
+
+    Args:
+        channels: that it has.
+    """
+    return channels * _PER_VALUE + _PER_ROW
 
 
 def require_memory(path: Path, need: int, what: str, instead: str = "") -> None:
@@ -47,8 +56,8 @@ def require_memory(path: Path, need: int, what: str, instead: str = "") -> None:
     if free is not None and need > free:
         fix = f"{instead}, or split the file" if instead else "split the file"
         raise FileFormatError(
-            f"{path} holds {what}, which need {_gigabytes(need)} of memory, and "
-            f"{_gigabytes(free)} are available; {fix}"
+            f"{path} holds {what}, which need {gigabytes(need)} of memory, and "
+            f"{gigabytes(free)} are available; {fix}"
         )
 
 
@@ -115,5 +124,6 @@ def _number(path: Path) -> int | None:
     return int(lines[0]) if lines and lines[0].strip().isdecimal() else None
 
 
-def _gigabytes(count: int) -> str:
+def gigabytes(count: int) -> str:
+    """A number of bytes as text, such as `4.2 GB`."""
     return f"{count / 1e9:.3g} GB"

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.gaps import fastest_step_of, usual_gap
+from offbeat.data.memory import require_rows, row_bytes
 from offbeat.data.scaler import moments
 from offbeat.data.schema import Schema
 from offbeat.data.store import load, save
@@ -153,18 +154,34 @@ class ShardedDataset:
                 channels are others than those of the first.
             InputError: an option is out of range.
         """
+        paths = sorted(Path(folder).glob("*.parquet"))
+        if not paths:
+            raise FileFormatError(
+                f"{folder} holds no Parquet files; give the folder that save_shards wrote to"
+            )
+        return cls.of_files(paths, window=window, cache_mb=cache_mb)
+
+    @classmethod
+    def of_files(
+        cls, paths: Sequence[Path], *, window: int | None = None, cache_mb: float = CACHE_MB
+    ) -> ShardedDataset:
+        """Opens files; see `open`.
+
+        Args:
+            paths: files that `save` or `save_shards` wrote.
+            window: as of `open`.
+            cache_mb: as of `open`.
+
+        Raises:
+            FileFormatError: as of `open`.
+            InputError: as of `open`.
+        """
         if window is not None and (
             isinstance(window, bool) or not isinstance(window, int) or window < 2
         ):
             raise InputError(f"window must be a number of rows of at least 2, got {window!r}")
         if not cache_mb > 0:
             raise InputError(f"cache_mb must be above 0, got {cache_mb!r}")
-        folder = Path(folder)
-        paths = sorted(folder.glob("*.parquet"))
-        if not paths:
-            raise FileFormatError(
-                f"{folder} holds no Parquet files; give the folder that save_shards wrote to"
-            )
         with ThreadPoolExecutor(4) as pool:
             opened = list(pool.map(_opened, paths))
         first = opened[0][1]
@@ -234,6 +251,20 @@ class ShardedDataset:
         if tuple(t.rows for t in part) != shard.rows:
             raise FileFormatError(f"{shard.path} was changed after the folder was opened")
         return part
+
+    @property
+    def bytes(self) -> int:
+        """Memory of all trajectories, about, if they were read at once."""
+        return self.rows * row_bytes(self.channels)
+
+    def whole(self) -> Dataset:
+        """All trajectories, in memory.
+
+        Raises:
+            FileFormatError: they need more memory than is available, or as of `part`.
+        """
+        require_rows(self.shards[0].path.parent, self.rows, self.channels, copies=2)
+        return Dataset(tuple(t for part in self.parts() for t in part), self.meta)
 
     def windows_of(self, shard: Shard) -> int:
         """Number of windows of a file in an epoch."""

@@ -32,6 +32,7 @@ from offbeat.data.readers import (
 from offbeat.data.readers.folders import FILES, check_paths, files_in, together
 from offbeat.data.readers.options import check_types
 from offbeat.data.recording import ReaderOptions, Recording, assemble
+from offbeat.data.shards import ShardedDataset
 from offbeat.data.source import require_source
 from offbeat.data.trajectory import Dataset
 from offbeat.errors import (
@@ -231,6 +232,8 @@ def _read_several(
         )
     reader = readers[paths[0]]
     own, cleaning = _split(options, reader)
+    if reader.function is READERS["offbeat"].function:  # each file is finished
+        return ShardedDataset.of_files(paths).whole()
     read_files: list[tuple[Path, list[Recording]]] = []
     refused: list[NoLogError] = []
     for path in paths:
