@@ -77,6 +77,17 @@ def write_json(path, stamps, values):
     return path.with_suffix(".jsonl")
 
 
+def write_ros_echo(path, stamps, values):
+    """As `ros2 topic echo` prints a stamp and a list, and NaN where nothing is known."""
+    messages = [
+        f"header:\n  stamp:\n    sec: {int(t) // 10**9}\n    nanosec: {int(t) % 10**9}\n"
+        f"  frame_id: base\nname:\n- hip\n- knee\nposition:\n- {x!r}\n- {y!r}\n---\n"
+        for t, (x, y) in zip(stamps, values.tolist(), strict=True)
+    ]
+    path.with_suffix(".yaml").write_text("".join(messages))
+    return path.with_suffix(".yaml")
+
+
 def number_of(value):
     """A number of JSON: null where nothing is known."""
     return None if np.isnan(value) else float(value)
@@ -151,6 +162,7 @@ WRITERS = {
     "npz written": written("npz", ".npz"),
     "feather": write_feather,
     "json": write_json,
+    "ros_echo": write_ros_echo,
     "mat": write_mat,
     "ardupilot": write_ardupilot,
     "tum": write_tum,

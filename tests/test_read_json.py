@@ -204,3 +204,57 @@ def test_a_format_that_is_not_read_names_how_to_convert_it(suffix, message, tmp_
     (tmp_path / f"log{suffix}").write_bytes(b"PK\3\4 and so on")
     with pytest.raises(FileFormatError, match=message):
         read(tmp_path / f"log{suffix}")
+
+
+ECHO = """header:
+  seq: {i}
+  stamp:
+    secs: 1700000000
+    nsecs: {nsecs}
+  frame_id: "base: [0, 1]"
+angle: {angle}
+ready: {ready}
+quaternion: [0.0, 1e-05, {angle}, 1.0]
+note: ''
+---
+"""
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".txt", ".log", ".txt.gz"])
+def test_messages_that_rostopic_printed(suffix, tmp_path):
+    text = "".join(
+        ECHO.format(i=i, nsecs=10_000_000 * i, angle=0.1 * i, ready=i % 2 == 0) for i in range(20)
+    )
+    text += "header:\n  seq: 20\n  sta"  # the printing was stopped
+    path = tmp_path / f"echo{suffix}"
+    path.write_bytes(gzip.compress(text.encode()) if suffix.endswith("gz") else text.encode())
+    (trajectory,) = (dataset := read(path))
+    assert trajectory.times == pytest.approx(0.01 * np.arange(20), abs=1e-9)
+    channel = dict(zip(trajectory.names, trajectory.values.T, strict=True))
+    np.testing.assert_allclose(channel["angle"], 0.1 * np.arange(20))
+    np.testing.assert_array_equal(channel["ready"], np.arange(20) % 2 == 0)
+    assert channel["quaternion[1]"][0] == 1e-05
+    assert any("last message" in note for note in dataset.meta["cleaning"]["notes"])
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "a: &x [1, 2]\nb: *x",
+        "a: " + 30 * "[" + 30 * "]",
+        30 * "- " + "1",
+        "a: [1",
+        "just text",
+        "a: 1\n...\nb: 2",
+        "a: !!python/object/apply:os.system ['true']",
+        "a: " + 300_000 * "1",
+        "",
+    ],
+)
+def test_hostile_messages_end_in_one_line(message, tmp_path):
+    path = tmp_path / "echo.yaml"
+    path.write_text(f"{message}\n---\n{message}\n---\n")
+    with pytest.raises(FileFormatError) as caught:
+        read(path, format="ros_echo", rate_hz=10)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400

@@ -289,8 +289,9 @@ class Dataset(Sequence[Trajectory]):
     meta: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        single = isinstance(self.trajectories, Trajectory)
-        trajectories = (self.trajectories,) if single else tuple(self.trajectories)
+        given: Any = self.trajectories
+        trajectories: tuple[Trajectory, ...]
+        trajectories = (given,) if isinstance(given, Trajectory) else tuple(given)
         if not trajectories:
             raise InputError("a data set needs at least one trajectory, got none")
         first = trajectories[0]

@@ -25,6 +25,7 @@ from offbeat.data.readers import (
     parquet,
     pose,
     ros,
+    ros_echo,
     table,
     text,
     ulog,
@@ -75,7 +76,7 @@ CONVERTED = {
 }
 """What is not read, by suffix, and how to convert it."""
 
-_OF_TEXT = ("ardupilot", "json", "csv")
+_OF_TEXT = ("ardupilot", "ros_echo", "json", "csv")
 """Formats whose files may be compressed."""
 
 FOLDER = "/"
@@ -423,6 +424,9 @@ register_reader(
     ardupilot.recordings,
     suffixes=(".log", ".txt", ".csv"),
     recognises=ardupilot.recognises,
+)
+register_reader(
+    "ros_echo", ros_echo.read_ros_echo, suffixes=ros_echo.SUFFIXES, recognises=ros_echo.recognises
 )
 register_reader("csv", table.read_csv, suffixes=(".csv", ".tsv", ".txt"))
 register_reader("npz", npz.read_npz, suffixes=(".npz", ".npy"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -88,9 +88,35 @@ def read_json_lines(
     path = require_file(path)
     require_memory(path, 8 * path.stat().st_size, f"{path.stat().st_size} bytes of JSON")
     notes: list[str] = []
-    rows = _by_type([_flat(row, path, i) for i, row in enumerate(_rows(path, notes))])
+    return recordings_of_rows(_rows(path, notes), path, "JSON", options, time_unit, notes)
+
+
+def recordings_of_rows(
+    objects: Iterable[Any],
+    path: Path,
+    what: str,
+    options: TableOptions,
+    time_unit: str | None,
+    notes: list[str],
+) -> list[Recording]:
+    """Recordings of nested objects, one per row.
+
+    Args:
+        objects: dicts of numbers, texts, lists and dicts.
+        path: the file, for messages.
+        what: name of the format, for messages.
+        options: which columns are what.
+        time_unit: as of `read_csv`.
+        notes: on the file, also such as are added while the objects are read.
+
+    Raises:
+        FileFormatError: one is no dict, or nested too deeply; there is no time, or no channel of
+            numbers.
+        InputError: an option names an unknown column or unit.
+    """
+    rows = _by_type([_flat(row, path, i) for i, row in enumerate(objects)])
     if not rows:
-        raise NoLogError(f"{path} holds no rows, expected an object per line")
+        raise NoLogError(f"{path} holds no rows, expected an object for each")
     names = dict.fromkeys(name for row in rows for name in row)
     if len(names) > MOST_CHANNELS:
         raise FileFormatError(f"{path} has {len(names)} columns, more than {MOST_CHANNELS}")
@@ -104,7 +130,7 @@ def read_json_lines(
     import pyarrow as pa
 
     table = pa.table({name: _column([row.get(name) for row in rows]) for name in names})
-    made = recordings_of(TableSource(path, "JSON", table), options, time_unit)
+    made = recordings_of(TableSource(path, what, table), options, time_unit)
     return [replace(one, notes=(*one.notes, *notes)) for one in made]
 
 
