@@ -1,7 +1,7 @@
 # Offbeat on the CPU, with the readers of robotics formats and the simulator:
 #   docker build -t offbeat .
 #   docker run --rm -v "$PWD":/data offbeat inspect arm.csv
-FROM python:3.12-slim AS build
+FROM python:3.12-slim-bookworm AS build
 RUN apt-get update && apt-get install --yes --no-install-recommends g++ \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
@@ -15,8 +15,8 @@ RUN python -m venv /opt/offbeat \
         '.[sim,ros,px4,hdf5]' \
     && /opt/offbeat/bin/python -c "from offbeat import kernels; assert kernels.cpu.instruction_sets()"
 
-FROM python:3.12-slim
-RUN apt-get update && apt-get install --yes --no-install-recommends libegl1 libosmesa6 \
+FROM python:3.12-slim-bookworm
+RUN apt-get update && apt-get install --yes --no-install-recommends libegl1 libgl1-mesa-dri \
     && rm -rf /var/lib/apt/lists/*
 COPY --from=build /opt/offbeat /opt/offbeat
 ENV PATH=/opt/offbeat/bin:$PATH MUJOCO_GL=egl OMP_NUM_THREADS=1

@@ -77,7 +77,7 @@ def learn_shards(
     samples = [_sampled(part, split, i) for i, part in enumerate(parts)]
     config = training or TrainConfig(seed=split.seed)
     if split.observed_fraction is not None and config.redraw is None:
-        config = replace(config, redraw=RedrawConfig((split.observed_fraction,), mask=split.mask))
+        config = replace(config, redraw=RedrawConfig((split.observed_fraction,), mask=split.mask))  # type: ignore[arg-type]
     train, validation, test = samples
     blend, fitted, said = train_blend(
         train,
