@@ -421,7 +421,8 @@ class TestAFolder:
         columns = [{"time": tables.TIMES, **tables.XY}] * 2
         folder = self.write(tmp_path, ["a1", "a2"], columns)
         (folder / "Annotation.csv").write_text("time,text\n")
-        (folder / "Metadata.csv").write_text("version,device\n3,phone\n")
+        about = "version,device,recording time\n3,phone,2025-03-12_08-14-02\n"
+        (folder / "Metadata.csv").write_text(about)
         dataset = read(folder)
         assert dataset.meta["labels"] == ["a1", "a2"]
         assert "left out: Annotation.csv, Metadata.csv" in notes(dataset)

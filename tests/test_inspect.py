@@ -12,6 +12,7 @@ from real_logs import shared
 
 import offbeat as ob
 from offbeat.cli.app import main
+from offbeat.cli.inspection_text import heading
 from offbeat.data.advice import advise
 from offbeat.data.inspection import inspect, without_repeats
 from offbeat.data.plan import plan, prepare
@@ -206,3 +207,24 @@ def test_an_angle_that_wraps_is_unwrapped_by_the_plan():
     assert chosen.reader["angles"] == ["heading", "bearing"]
     heading = prepare(data, chosen)[0].values[:, 0]
     np.testing.assert_allclose(heading, 0.8 * times, atol=1e-9)
+
+
+def test_an_angle_without_a_unit_is_found_by_its_name_and_its_jumps():
+    times = np.arange(0, 60, 0.01)
+    wrapped = (0.8 * times + np.pi) % (2 * np.pi) - np.pi
+    turns = {"arm.yaw": wrapped, "Bearing": np.degrees(wrapped), "level": wrapped}
+    steady = {"pitch": np.sin(times), "rolling": wrapped}
+    values = np.column_stack([*turns.values(), *steady.values()])
+    data = ob.Dataset((ob.Trajectory(times, values, names=(*turns, *steady)),))
+    chosen = plan(data)
+    assert chosen.reader["angles"] == ["arm.yaw", "Bearing"]
+    clean = prepare(data, chosen)[0].values
+    np.testing.assert_allclose(clean[:, 0], 0.8 * times, atol=1e-9)
+    np.testing.assert_allclose(clean[:, 1], np.degrees(0.8 * times), atol=1e-7)
+    assert "angles" not in plan(data, known=["outliers"]).reader
+
+
+def test_the_heading_of_a_slow_log_says_how_long_it_is_and_how_far_rows_are_apart():
+    times = 600.0 * np.arange(1000)
+    data = ob.Dataset((ob.Trajectory(times, np.sin(times / 5e4)[:, None]),))
+    assert "1000 rows in 599400 s (6.94 days), one in 600 s, 1 channels" in heading(inspect(data))

@@ -6,17 +6,18 @@ from offbeat.data.inspection import ChannelInspection, EpisodeInspection, Inspec
 from offbeat.tables import plain
 
 _MOST_EPISODES = 12
+_SLOW_HZ = 0.1  # below it, a time tells more than a rate
 
 
 def heading(inspection: Inspection) -> str:
     """One line on the log as a whole."""
     episodes = len(inspection.episodes)
     lasts = sum(episode.duration_s for episode in inspection.episodes)
-    rate = "" if inspection.rate_hz is None else f", {inspection.rate_hz:.4g} Hz"
+    rate = "" if inspection.rate_hz is None else f", {_rate(inspection.rate_hz)}"
     return (
         f"{inspection.source or 'data set'} ({inspection.format}, times in "
         f"{inspection.time_unit}): {episodes} episode{'' if episodes == 1 else 's'}, "
-        f"{inspection.rows} rows in {lasts:.6g} s{rate}, {len(inspection.channels)} channels, "
+        f"{inspection.rows} rows in {_duration(lasts)}{rate}, {len(inspection.channels)} channels, "
         f"{100 * inspection.known:.1f} % of the values known"
     )
 
@@ -55,6 +56,18 @@ def channel_table(inspection: Inspection) -> str:
         "range",
     )
     return plain([header, *rows], left=(0, 1, 7, 8))
+
+
+def _rate(hz: float) -> str:
+    return f"{hz:.4g} Hz" if hz >= _SLOW_HZ else f"one in {_duration(1 / hz)}"
+
+
+def _duration(seconds: float) -> str:
+    """In seconds, and in days or hours where it is long."""
+    for unit, size in (("days", 86_400), ("hours", 3_600)):
+        if seconds >= 2 * size:
+            return f"{seconds:.6g} s ({seconds / size:.3g} {unit})"
+    return f"{seconds:.6g} s"
 
 
 def _kind(channel: ChannelInspection) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -25,6 +26,12 @@ from offbeat.errors import InputError, listed
 
 CHOSEN = ("outliers", "repeated", "angles")
 """Options of readers that are chosen."""
+
+_ANGLE = re.compile(
+    r"(?:^|[^a-z])(?:yaw|roll|pitch|heading|bearing|course|azimuth|theta|psi|phi|angle)(?:$|[^a-z])",
+    re.IGNORECASE,
+)
+"""Names of channels that are angles where they jump like one."""
 
 _FEWEST_ROWS = 24
 _FEWEST_EPISODES = 10  # for a split by trajectory
@@ -194,8 +201,8 @@ def cleaned(dataset: Dataset, options: Mapping[str, Any]) -> Dataset:
     for name in options.get("angles", ()):
         if name in dataset.names:
             c = dataset.names.index(name)
-            period = full_turn(dataset.units[c])
             values = np.concatenate([known_values(t, c) for t in dataset])
+            period = _turn_of(dataset.units[c], values)
             angles[name] = Angle(period, lowest_of(values.min(), values.max(), period))
     return Transforms(angles).apply(dataset) if angles else dataset
 
@@ -235,19 +242,27 @@ def _together(dataset: Dataset) -> list[list[int]]:
     return [[states[k] for k in group] for group in groups]
 
 
+def _turn_of(unit: str, values: Values) -> float:
+    """A full turn; without a unit, of radians where values are within one turn of 0."""
+    within = np.abs(values).max(initial=0.0) <= 1.001 * full_turn("rad")
+    return full_turn(unit or ("rad" if within else "deg"))
+
+
 def find_wrapping(dataset: Dataset) -> list[str]:
-    """Channels in units of angle that jump by a full turn, and otherwise move by far less.
+    """Channels that jump by a full turn, and otherwise move by far less.
+
+    They are in units of angle, or state no unit and have the name of an angle, such as `yaw`.
 
     Args:
         dataset: as read.
     """
     found = []
     for c, (name, unit) in enumerate(zip(dataset.names, dataset.units, strict=True)):
-        if not is_angle_unit(unit):
+        if not is_angle_unit(unit) and (unit or not _ANGLE.search(name)):
             continue
-        turn = full_turn(unit)
         columns = [known_values(t, c) for t in dataset]
         values = np.concatenate(columns)
+        turn = _turn_of(unit, values)
         steps = np.concatenate([np.abs(np.diff(column)) for column in columns])
         if not len(steps) or lowest_of(values.min(), values.max(), turn) is None:
             continue
@@ -281,7 +296,7 @@ def _reader(
         options["angles"] = [*options.get("angles", ()), *wrapping]
         notes.append(
             f"angles that jump by a full turn: {listed(wrapping)}; they are unwrapped, and given "
-            "back wrapped"
+            "back wrapped (--reader.angles=[] leaves them as they are)"
         )
     return options, notes
 

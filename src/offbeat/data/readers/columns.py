@@ -355,7 +355,7 @@ def stamp_columns(
         name
         for name in names
         if may_be_time(name)
-        and (_increases(sample.numbers(name)) or form_of(_first(sample.texts(name))) is not None)
+        and (_increases(sample.numbers(name)) or _are_times(sample.texts(name)))
     ]
     if not pairs and len(likely) == 1:
         return made(likely[0], note=f"{likely[0]!r} is taken for the time: it alone is named like "
@@ -403,6 +403,11 @@ def _refuse_dates(
 def _increases(numbers: NDArray[np.float64]) -> bool:
     steps = np.diff(numbers[np.isfinite(numbers)])
     return len(steps) > 1 and bool((steps >= 0).all()) and bool((steps > 0).any())
+
+
+def _are_times(texts: Sequence[str]) -> bool:
+    """Whether texts have a form of times, and more than two differ: a single one may be a date."""
+    return len({*texts} - {""}) > 2 and form_of(_first(texts)) is not None
 
 
 def _is_date(sample: Sample, name: str) -> bool:
