@@ -154,6 +154,9 @@ struct Kernels {
   void (*perceptron_backward)(const PerceptronJob<T>&, int slot, T* scratch);
   void (*perceptron_reduce)(const Perceptron&, const T* sums, int slots, T* flat);
 
+  void (*adamax)(int64_t n, const T* gradient, T lerp, T beta, T eps, T step, T* average,
+                 T* largest, T* weights);
+
   int64_t (*stream_packed_size)(const Spec&);
   void (*stream_pack)(const Spec&, const T* flat, T* packed);
   int64_t (*stream_scratch)(const Spec&);

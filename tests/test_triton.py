@@ -216,7 +216,7 @@ def test_compiled_kernels_fit_into_shared_memory_and_registers():
     `python -m offbeat.kernels.triton.offline` compiles every shape of the benchmark.
     """
     command = "-m offbeat.kernels.triton.offline --json --arch 80 90 --hidden 64"
-    command += " --batch 50 --precision ieee --anchored yes --kernel backward"
+    command += " --batch 50 --precision ieee tf32 --anchored yes --kernel backward"
     done = subprocess.run(
         [sys.executable, *command.split()],
         capture_output=True,
@@ -225,8 +225,8 @@ def test_compiled_kernels_fit_into_shared_memory_and_registers():
         env={**os.environ, "TRITON_INTERPRET": "0"},
     )
     found = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [one["arch"] for one in found] == [80, 90]
-    for one, limit in zip(found, (99, 227), strict=True):
+    assert [one["arch"] for one in found] == [80, 80, 90, 90]
+    for one, limit in zip(found, (99, 99, 227, 227), strict=True):
         assert 0 < one["shared"] <= limit * 1024
         assert one["spilled"] == 0
         assert one["registers"] <= 255

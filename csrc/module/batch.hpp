@@ -99,9 +99,11 @@ Call<T> prepare(const Spec& s, const Kernels<T>& kernels, const StepInputs<T>& f
   call.order_lanes(batch, f.rows, lengths, f.index ? f.index->data() : nullptr);
   call.job.max_steps = most_steps(s, call);
   call.plan(s, kernels);
-  // Rows whose weight gradients are added together: about eight evaluations of the vector field.
-  const int evaluations = s.field.layers ? s.stages * call.job.max_steps : 1;
-  call.job.group = std::clamp(8 / evaluations, 1, MAX_GROUP);
+  // Rows whose weight gradients are added together: about 64 lanes of evaluations of the vector
+  // field, whose activations and gradients stay in the cache; without one, eight rows.
+  const int64_t steps = s.field.layers ? s.stages * call.job.max_steps : 1;
+  const int64_t lanes = s.field.layers ? 2 * kernels.width : 8;
+  call.job.group = int(std::clamp<int64_t>(64 / (steps * lanes), 1, MAX_GROUP));
   return call;
 }
 

@@ -53,6 +53,7 @@ using Maybe = std::optional<Const<T>>;
 #include "step_inputs.hpp"
 #include "batch.hpp"
 #include "perceptron.hpp"
+#include "flat_weights.hpp"
 #include "gains.hpp"
 #include "batch_gains.hpp"
 #include "stream.hpp"
@@ -172,6 +173,23 @@ void bind(nb::module_& m, const char* suffix) {
       nb::arg("shape"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
       nb::arg("x").noconvert(), nb::arg("tape").noconvert(), nb::arg("to_y").noconvert(),
       nb::arg("to_weights").noconvert(), nb::arg("to_x").noconvert().none(), nb::arg("threads"));
+  m.def(
+      "adamax",
+      [](const std::string& set, Const<T> gradient, double lerp, double beta, double eps,
+         double step, Array<T> average, Array<T> largest, Array<T> weights) {
+        adamax<T>(find_instruction_set(set), gradient, lerp, beta, eps, step, average, largest,
+                  weights);
+      },
+      nb::arg("instruction_set"), nb::arg("gradient").noconvert(), nb::arg("lerp"),
+      nb::arg("beta"), nb::arg("eps"), nb::arg("step"), nb::arg("average").noconvert(),
+      nb::arg("largest").noconvert(), nb::arg("weights").noconvert());
+  m.def(
+      "move_weights",
+      [](Array<T> to, Const<T> from, Const<int64_t> places, bool add) {
+        move_weights<T>(to, from, places, add);
+      },
+      nb::arg("to").noconvert(), nb::arg("source").noconvert(), nb::arg("places").noconvert(),
+      nb::arg("add"));
   m.def(
       "filter_gains",
       [](Const<double> filters, Const<double> delta, Const<bool> mask, Const<bool> started,

@@ -49,44 +49,73 @@ static constexpr int panels_at_once() {
   return NV > 1 ? 1 : (VECTOR_BYTES == 64 ? 32 : 16) / 2 / TILE;
 }
 
-// The same for `LANES` lanes of a vector that is mostly empty: vectors run over the outputs of N
-// panels, so that unused lanes cost nothing. Unused lanes are set to 0.
-template <int LANES, int N, bool ACCUMULATE, class Finish>
-static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y,
-                              int64_t at, const Finish& finish) {
-  y += at;
-  static_assert(TILE == 4, "a panel is four floats wide");
-  F4 acc[N][LANES];
-  for (int n = 0; n < N; ++n)
-    for (int lane = 0; lane < LANES; ++lane)
-      for (int r = 0; r < TILE; ++r) {
-        const int o = n * TILE + r;
-        acc[n][lane][r] =
-            ACCUMULATE ? (o < rows ? y[o * VW + lane] : T(0)) : (bias ? bias[o] : T(0));
-      }
-  for (int k = 0; k < in; ++k)
-    for (int n = 0; n < N; ++n) {
-      const F4 wv = load_four(w + (int64_t(n) * in + k) * TILE);
-      for (int lane = 0; lane < LANES; ++lane)
-        acc[n][lane] = fma_four(wv, x[int64_t(k) * VW + lane] - F4{}, acc[n][lane]);
-    }
-  for (int o = 0; o < N * TILE && o < rows; ++o) {
-    store<T>(y + o * VW, splat(0));
-    for (int lane = 0; lane < LANES; ++lane) y[o * VW + lane] = acc[o / TILE][lane][o % TILE];
-    store<T>(y + o * VW, finish(load<T>(y + o * VW), at + o * VW));
+// The same for `LANES` lanes of a vector that is mostly empty: vectors run over the outputs of
+// several panels, so that unused lanes cost nothing. They are set to 0. `X` is such a vector, or
+// four floats for the last panels.
+template <int LANES, class X, class Finish>
+static INLINE void few_store(const X (&acc)[LANES], int rows, T* y, int64_t at,
+                             const Finish& finish) {
+  for (int r = 0; r < int(sizeof(X) / sizeof(T)) && r < rows; ++r) {
+    V lanes = splat(0);
+    for (int lane = 0; lane < LANES; ++lane) lanes[lane] = acc[lane][r];
+    store<T>(y + at + r * VW, finish(lanes, at + r * VW));
   }
 }
-template <int LANES, int N, bool ACCUMULATE, class Finish>
+template <int LANES, int N, class X, bool ACCUMULATE, class Finish>
+static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y,
+                              int64_t at, const Finish& finish) {
+  static_assert(TILE == 4, "a panel is four floats wide");
+  constexpr int WIDE = sizeof(X) / sizeof(T);
+  X acc[N][LANES];
+  for (int n = 0; n < N; ++n)
+    for (int lane = 0; lane < LANES; ++lane)
+      for (int r = 0; r < WIDE; ++r) {
+        const int o = n * WIDE + r;
+        acc[n][lane][r] =
+            ACCUMULATE ? (o < rows ? y[at + o * VW + lane] : T(0)) : (bias ? bias[o] : T(0));
+      }
+  const int64_t panel = int64_t(TILE) * in;
+  for (int k = 0; k < in; ++k)
+    for (int n = 0; n < N; ++n) {
+      const T* from = w + (n * WIDE / TILE) * panel + k * TILE;
+      X wv;
+      if constexpr (WIDE == TILE)
+        wv = load_four(from);
+      else
+        wv = load_fours(from, panel);
+      for (int lane = 0; lane < LANES; ++lane) {
+        const T xv = x[int64_t(k) * VW + lane];
+        if constexpr (WIDE == TILE)
+          acc[n][lane] = fma_four(wv, xv - F4{}, acc[n][lane]);
+        else
+          acc[n][lane] = fma(wv, splat(xv), acc[n][lane]);
+      }
+    }
+  for (int n = 0; n < N; ++n)
+    few_store<LANES>(acc[n], rows - n * WIDE, y, at + int64_t(n) * WIDE * VW, finish);
+}
+template <int LANES, bool ACCUMULATE, class Finish>
 static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y,
                          const Finish& finish) {
+  constexpr int N = (VECTOR_BYTES == 64 ? 12 : 8) / LANES;
   int o = 0;
-  for (; o + N * TILE <= out; o += N * TILE)
-    few_panels<LANES, N, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, N * TILE, in,
-                                     x, y, int64_t(o) * VW, finish);
-  for (; o < out; o += TILE)
-    few_panels<LANES, 1, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, out - o, in, x,
-                                     y, int64_t(o) * VW, finish);
+  auto panels = [&](auto wide, auto n) {
+    using X = decltype(wide);
+    constexpr int MOST = n(), OUT = MOST * int(sizeof(X) / sizeof(T));
+    few_panels<LANES, MOST, X, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
+                                           out - o < OUT ? out - o : OUT, in, x, y,
+                                           int64_t(o) * VW, finish);
+    o += OUT;
+  };
+  while (o + N * VW <= out) panels(V{}, Count<N>{});
+  while (o + 2 * VW <= out) panels(V{}, Count<2>{});
+  while (o + VW <= out) panels(V{}, Count<1>{});
+  while (o < out) panels(F4{}, Count<1>{});
 }
+template <int N>
+struct Count {
+  constexpr int operator()() const { return N; }
+};
 
 // How lanes are laid out: `Many` is a block of NV vectors of lanes, `One` the one lane of a stream.
 template <int NV>
@@ -114,10 +143,10 @@ struct Many {
   static INLINE void product(const T* w, const T* bias, int out, int in, int lanes, const T* x,
                              T* y, const Finish& finish) {
     if constexpr (NV == 1 && sizeof(T) == 4) {
-      if (lanes == 1) return few<1, 8, ACCUMULATE>(w, bias, out, in, x, y, finish);
-      if (lanes == 2) return few<2, 4, ACCUMULATE>(w, bias, out, in, x, y, finish);
-      if (VW > 4 && lanes == 3) return few<3, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
-      if (VW > 4 && lanes == 4) return few<4, 3, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (lanes == 1) return few<1, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (lanes == 2) return few<2, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (VW > 4 && lanes == 3) return few<3, ACCUMULATE>(w, bias, out, in, x, y, finish);
+      if (VW > 4 && lanes == 4) return few<4, ACCUMULATE>(w, bias, out, in, x, y, finish);
     }
     constexpr int P = panels_at_once<NV>(), R = P * TILE;
     int o = 0;

@@ -23,6 +23,7 @@ constexpr Kernels<T> make_kernels() {
   t.perceptron_forward = S::perceptron_forward;
   t.perceptron_backward = S::perceptron_backward;
   t.perceptron_reduce = S::perceptron_reduce;
+  t.adamax = S::adamax;
   t.stream_packed_size = S::stream_packed_size;
   t.stream_pack = S::stream_pack;
   t.stream_scratch = S::stream_scratch;

@@ -28,4 +28,5 @@ struct Scan {
 #include "cells.hpp"
 #include "perceptron.hpp"
 #include "stream.hpp"
+#include "optimizer.hpp"
 };

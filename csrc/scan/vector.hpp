@@ -71,6 +71,23 @@ INLINE F4 fma_four(F4 a, F4 b, F4 c) {
 INLINE F4 fma_four(F4 a, F4 b, F4 c) { return a * b + c; }
 #endif
 
+// A vector from runs of four floats that are `stride` apart.
+#if defined(__AVX512F__) && VECTOR_BYTES == 64
+INLINE VF load_fours(const float* p, int64_t stride) {
+  __m512 v = _mm512_castps128_ps512(_mm_loadu_ps(p));
+  v = _mm512_insertf32x4(v, _mm_loadu_ps(p + stride), 1);
+  v = _mm512_insertf32x4(v, _mm_loadu_ps(p + 2 * stride), 2);
+  return (VF)_mm512_insertf32x4(v, _mm_loadu_ps(p + 3 * stride), 3);
+}
+#elif defined(__AVX__) && VECTOR_BYTES == 32
+INLINE VF load_fours(const float* p, int64_t stride) {
+  return (VF)_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)),
+                                  _mm_loadu_ps(p + stride), 1);
+}
+#else
+INLINE VF load_fours(const float* p, int64_t) { return load(p); }
+#endif
+
 // NaN stays NaN: the processor's minimum and maximum return their second operand if either is NaN.
 #if defined(__AVX512F__) && VECTOR_BYTES == 64
 INLINE VF at_most(VF x, float b) { return (VF)_mm512_min_ps((__m512)broadcast(b), (__m512)x); }

@@ -58,9 +58,12 @@ static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, int lanes, con
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
     for (int e = 0; e < n; ++e)
       transpose(x[first + e], m.in, in, W, lanes, xt + int64_t(e) * lanes * in);
-    for (int i = 0; i < in;) {  // strips of three vectors, then of two or one
+    for (int i = 0; i < in;) {  // strips of three or four vectors, then of two or one
       const int left = (in - i) / VW;
-      if (left == 3 || left > 4) {
+      if (VECTOR_BYTES == 64 && left == 4) {  // AVX-512 has registers for sixteen sums
+        outer_strip<4, 4>(n, W, lanes, to_out + first, m.out, xt, in, i, sum);
+        i += 4 * VW;
+      } else if (left == 3 || left > 4) {
         outer_strip<4, 3>(n, W, lanes, to_out + first, m.out, xt, in, i, sum);
         i += 3 * VW;
       } else if (left >= 2) {

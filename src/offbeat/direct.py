@@ -8,8 +8,10 @@ losses other than the mean squared error of all values.
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import mse_loss
@@ -18,12 +20,14 @@ from offbeat.config import Recipe
 from offbeat.distributed import current
 from offbeat.examples import Examples
 from offbeat.kernels import StepTable, choose, cpu
+from offbeat.kernels.backends import BACKENDS, selected
+from offbeat.kernels.optimizer import CompiledAdamax
 from offbeat.kernels.spec import ScanSpec, TableSteps
 from offbeat.models.base import BaseModel
 from offbeat.models.model import Model
 from offbeat.parts import Point
 from offbeat.parts.heads import Prediction
-from offbeat.run import RunState
+from offbeat.run import FlatParameters, RunState
 
 _MEAN = 1
 """Reduction of a loss, as torch's operators number it."""
@@ -50,6 +54,8 @@ def unsupported(model: BaseModel, examples: object, recipe: Recipe) -> str | Non
     choice = choose(model.spec, model.dtype, model.device)
     if choice.backend.name != "cpu":
         return f"its scan runs in {choice.backend.name}"
+    if not hasattr(cpu.compiled, "move_weights"):
+        return "the compiled module is of an earlier version; build it again"
     parts, one = model.scan_parts(), examples.prepared.take(torch.zeros(1, dtype=torch.int64))
     if reason := cpu.unsupported(model.spec, parts, one, model.first_state(1)):
         return reason
@@ -72,16 +78,17 @@ class DirectStep:
 
     def __init__(self, model: Model, examples: Examples, state: RunState) -> None:
         self.model, self.examples, self.parameters = model, examples, state.parameters
+        self.asked = _asked(model)
         choice = choose(model.spec, model.dtype, model.device)
-        self.choice = choice
+        self._optimizer = CompiledAdamax(state.optimizer, state.parameters.flat, choice.variant)
         self._scan = _Scan(model.spec, choice.variant)
-        self._weights = _Packed(list(model.scan_parts().tensors()))
+        self._weights = _Packed(list(model.scan_parts().tensors()), self.parameters)
         layers = model.head.layers
         self._decoder = None
         if layers:
             sizes = (layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers))
             self._decoder = _Decoder(sizes, choice.variant)
-            self._decoder_weights = _Packed([t for layer in layers for t in layer])
+            self._decoder_weights = _Packed([t for layer in layers for t in layer], self.parameters)
         self._shifted = model.config.readout == "last_row"
         # Buffers: the first state, the states that are decoded, and gradients of states.
         self._first = self._read = self._to_read = self._to_after = torch.empty(0)
@@ -172,22 +179,37 @@ class DirectStep:
             assert self.model.start.grad is not None
             self.model.start.grad.add_(to_first.sum(0)[: self.model.channels])
 
+    def descend(self) -> None:
+        """Takes the step of the optimizer."""
+        self._optimizer.step()
+
+
+def _asked(model: Model) -> tuple[Any, ...]:
+    """What the choice of a backend for a model depends on."""
+    return (*selected(), *BACKENDS, model.dtype, model.device)
+
 
 class _Packed:
     """Parameters in one buffer, in the order of the compiled code."""
 
-    def __init__(self, parameters: list[Any]) -> None:
-        self._parameters = parameters
-        self._flat = [p.detach().reshape(-1) for p in parameters]
-        self._buffer = torch.cat(self._flat)
-        self._sizes = [len(p) for p in self._flat]
-        self._gradients = [p.grad.view(-1) for p in parameters]
+    def __init__(self, parameters: list[Any], flat: FlatParameters) -> None:
+        # (parameters, 3): where each lies in `flat`, where in the buffer, and its length.
+        sizes = [p.numel() for p in parameters]
+        start, width = flat.flat.data_ptr(), flat.flat.element_size()
+        there = [(p.data_ptr() - start) // width for p in parameters]
+        here = [0, *accumulate(sizes)]
+        self._from = np.array([there, here[:-1], sizes], dtype=np.int64).T.copy()
+        self._to = self._from[:, [1, 0, 2]].copy()
+        self._flat = flat.flat.detach().numpy()
+        self._gradient = flat.gradient.numpy()
+        self._buffer = torch.empty(here[-1], dtype=flat.flat.dtype)
 
     def gather(self) -> Tensor:
-        return torch.cat(self._flat, out=self._buffer)
+        cpu.compiled.move_weights(self._buffer.numpy(), self._flat, self._to, False)
+        return self._buffer
 
     def add(self, gradient: Tensor) -> None:
-        torch._foreach_add_(self._gradients, torch.split(gradient, self._sizes))
+        cpu.compiled.move_weights(self._gradient, gradient.numpy(), self._from, True)
 
 
 class _Scan:
@@ -303,7 +325,4 @@ def direct_step(
             made = DirectStep(model, examples, state)
         known = state.direct = (model, examples, made)
     step: DirectStep | None = known[2]
-    if step is None:
-        return None
-    own = step.model
-    return step if choose(own.spec, own.dtype, own.device) == step.choice else None
+    return step if step is not None and _asked(step.model) == step.asked else None

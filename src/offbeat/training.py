@@ -434,7 +434,7 @@ def train_step(
         _set_rate(state, recipe, total)
         direct.backward(recipe.loss_scale)
         _clip(state, recipe)
-        state.optimizer.step()
+        direct.descend()
         return value
     with autocast(model, recipe.precision):
         loss = examples.loss(model, index, _generator(model, state, recipe))

@@ -96,13 +96,16 @@ def precision() -> str:
     return "ieee" if torch.get_float32_matmul_precision() == "highest" else "tf32"
 
 
-def tiles(spec: ScanSpec, trajectories: int) -> tuple[int, int, int]:
+def tiles(spec: ScanSpec, trajectories: int, precision: str = "ieee") -> tuple[int, int, int]:
     """Trajectories of a program, units of a tile, and units that are summed at once.
 
     Args:
         spec: of the scan.
         trajectories: of all runs.
+        precision: of products.
     """
+    if precision != "ieee" and spec.anchored:
+        return 16, 32, 16  # products in TF32 need more registers; wider tiles spill
     widest = max(spec.hidden_size, spec.anchors, *spec.field, 16)
     down = 16 if trajectories < 2048 else 32
     across = 1 << (widest - 1).bit_length()
@@ -212,7 +215,8 @@ def scan_stacked(
         reason = supports(spec, state.dtype, state.device) or unsupported(one, rows, state)
         if reason:
             raise RuntimeError(f"the triton backend cannot run this scan: {reason}")
-    shape = Shape.of(spec, tiles(spec, state.shape[0] * state.shape[1]), precision())
+    products = precision()
+    shape = Shape.of(spec, tiles(spec, state.shape[0] * state.shape[1], products), products)
     each = [_Operands.of(spec, one, rows) for one, rows in zip(parts, inputs, strict=True)]
     operands = each[0] if len(each) == 1 else _Operands.stacked(each)
     packed = torch.stack([_packed(shape, one, state) for one in parts])

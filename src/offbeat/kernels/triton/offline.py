@@ -157,7 +157,7 @@ def main() -> None:
     chosen = product(given.arch, given.precision, given.hidden, given.batch, given.anchored)
     for (arch, precision, hidden, batch, anchored), kernel in product(chosen, given.kernel):
         spec = example(hidden, anchored=anchored == "yes")
-        shape = Shape.of(spec, tiles(spec, batch), precision)
+        shape = Shape.of(spec, tiles(spec, batch, precision), precision)
         one = compiled(kernel, shape, arch)
         if given.json:
             print(json.dumps(asdict(one)), flush=True)
