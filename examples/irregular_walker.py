@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 
 import offbeat as ob
+from examples.linear_state_space import LRUNetwork
 from examples.policies.robots import HERE, linear
 from examples.real_logs.results import machine
 from offbeat.baselines import fit_baseline
@@ -40,14 +41,15 @@ COMPOSED = {"hidden_size": 64, "init": "fan_in", "field_units": (64, 64)}
 
 
 class Foreign(nn.Module):
-    """A recurrent network of `ncps` on the frames that are left, and the times between them.
+    """A network of others on the frames that are left, and the times between them.
 
     `ncps.torch` takes `timespans[:, row].squeeze()` of a batch, (batch,), which broadcasts against
     (batch, units) along the wrong axis. So they are given as (batch, rows, units).
 
     Args:
         data: that it is made for.
-        kind: `cfc`, `cfc_mixed` (with the memory of an LSTM) or `ltc`.
+        kind: `cfc`, `cfc_mixed` (with the memory of an LSTM) or `ltc` of `ncps`, or `lru`, the
+            linear state-space network of `examples.linear_state_space`.
         units: hidden units.
         change: whether it predicts the change since the last frame.
     """
@@ -56,11 +58,15 @@ class Foreign(nn.Module):
         self, data: ob.DataInfo, kind: str = "cfc", units: int = 64, change: bool = False
     ) -> None:
         super().__init__()
-        from ncps.torch import LTC, CfC
+        self.linear = kind == "lru"
+        if self.linear:
+            self.network: nn.Module = LRUNetwork(data.channels, units)
+        else:
+            from ncps.torch import LTC, CfC
 
-        mixed = {"mixed_memory": True} if kind == "cfc_mixed" else {}
-        made = LTC if kind == "ltc" else CfC
-        self.network = made(data.channels, units, batch_first=True, **mixed)
+            mixed = {"mixed_memory": True} if kind == "cfc_mixed" else {}
+            made = LTC if kind == "ltc" else CfC
+            self.network = made(data.channels, units, batch_first=True, **mixed)
         self.read = nn.Linear(units, data.channels)
         self.units, self.change = units, change
         self.gap = data.statistics.median_gap
@@ -74,8 +80,12 @@ class Foreign(nn.Module):
         stamps = batch.times.gather(1, order)
         gaps = torch.diff(stamps, dim=1, prepend=stamps[:, :1] - self.gap) / self.gap
         real = torch.arange(order.shape[1], device=order.device) < count[:, None]
-        spans = torch.where(real, gaps, 1.0).to(frames.dtype)[..., None]
-        hidden, _ = self.network(frames, timespans=spans.expand(-1, -1, self.units))
+        spans = torch.where(real, gaps, 1.0).to(frames.dtype)
+        if self.linear:
+            hidden = self.network(frames, spans)
+        else:
+            each = spans[..., None].expand(-1, -1, self.units)
+            hidden, _ = self.network(frames, timespans=each)
         after = self.read(hidden) + (frames if self.change else 0.0)
         before = left.cumsum(dim=1) - left.to(torch.int64) - 1  # the last frame before a row
         known = (before >= 0)[..., None]
@@ -88,7 +98,10 @@ def _at(values: Tensor, rows: Tensor) -> Tensor:
 
 
 ob.register_model(
-    "ncps", Foreign, recipe={"optimizer": "adam", "loss_scale": 1.0, "clip_norm": 1.0}, replace=True
+    "foreign",
+    Foreign,
+    recipe={"optimizer": "adam", "loss_scale": 1.0, "clip_norm": 1.0},
+    replace=True,
 )
 
 MODELS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -97,11 +110,12 @@ MODELS: dict[str, tuple[str, dict[str, Any]]] = {
     "ODE-RNN": ("ode_rnn", {}),
     "ODE-GRU-D": ("ode_gru_d", {}),
     "anchored": ("anchored_ode_gru_d", {}),
-    "CfC": ("ncps", {"kind": "cfc"}),
-    "CfC-mmRNN": ("ncps", {"kind": "cfc_mixed"}),
-    "CfC, change of the last frame": ("ncps", {"kind": "cfc", "change": True}),
+    "CfC": ("foreign", {"kind": "cfc"}),
+    "CfC-mmRNN": ("foreign", {"kind": "cfc_mixed"}),
+    "CfC, change of the last frame": ("foreign", {"kind": "cfc", "change": True}),
     "ODE-LSTM": ("ode_rnn", {"cell": "lstm"}),
-    "LTC": ("ncps", {"kind": "ltc"}),
+    "LTC": ("foreign", {"kind": "ltc"}),
+    "LRU, two layers": ("foreign", {"kind": "lru"}),
 }
 BASELINES = {"last value": "last_value", "ridge": "ridge"}
 
@@ -180,7 +194,7 @@ def run(name: str, seed: int, data: tuple[ob.Dataset, ...], epochs: int) -> dict
         seconds = time.process_time() - began
         return {"mse": mean_squared_error(found, test), "seconds": round(seconds, 1)}
     kind, options = MODELS[name]
-    own = options if kind == "ncps" else {**COMPOSED, **options}
+    own = options if kind == "foreign" else {**COMPOSED, **options}
     model = ob.make_model(kind, train, seed=seed, **own)
     config = ob.TrainConfig(
         epochs=epochs, batch_size=64, optimizer="adam", learning_rate=0.005, schedule="cosine",

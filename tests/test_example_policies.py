@@ -6,10 +6,12 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from scipy import stats
 
 import offbeat as ob
 from examples import irregular_walker
+from examples.linear_state_space import LRU
 from examples.policies import paired
 from examples.policies.measures import distances, swept_error_area
 from examples.policies.shapes import RETURNS_S, cloned, pushed
@@ -104,15 +106,28 @@ def _steps(window: ob.Trajectory) -> np.ndarray:
     return (window.values[rows + 1, 1] - window.values[rows, 1]) ** 2
 
 
-@pytest.mark.parametrize("kind", ["cfc", "cfc_mixed", "ltc"])
-def test_networks_of_ncps_predict_a_window_alike_alone_and_among_others(kind):
-    pytest.importorskip("ncps")
+def test_a_linear_recurrent_unit_is_a_sum_of_decayed_inputs():
+    unit = LRU(2, 3).double()
+    x, gaps = torch.randn(1, 4, 2).double(), torch.tensor([[1.0, 0.5, 2.0, 0.25]]).double()
+    rate = torch.complex(-unit.log_decay.exp(), unit.log_angle.exp())
+    gamma = (1 - rate.exp().abs() ** 2).sqrt()
+    since = gaps.sum() - gaps.cumsum(dim=1)[0]
+    given = gamma * ((x[0] + 0j) @ torch.view_as_complex(unit.b))
+    state = (torch.exp(since[:, None] * rate) * given).sum(dim=0)
+    last = (state @ torch.view_as_complex(unit.c)).real + unit.d * x[0, -1]
+    assert torch.allclose(unit(x, gaps)[0, -1], last)
+
+
+@pytest.mark.parametrize("kind", ["cfc", "cfc_mixed", "ltc", "lru"])
+def test_networks_of_others_predict_a_window_alike_alone_and_among_others(kind):
+    if kind != "lru":
+        pytest.importorskip("ncps")
     random = _random()
     made = []
     for i in range(3):
         times = np.cumsum(random.uniform(0.5, 2.0, 200 + i))
         made += irregular_walker.windows(ob.Trajectory(times, np.sin(times)[:, None]), random, 60)
-    model = ob.make_model("ncps", ob.Dataset(tuple(made)), kind=kind, units=8)
+    model = ob.make_model("foreign", ob.Dataset(tuple(made)), kind=kind, units=8)
     together = irregular_walker.predicted(model, ob.Dataset(tuple(made)))
     for i, window in enumerate(made):
         alone = irregular_walker.predicted(model, ob.Dataset((window,)))[0]

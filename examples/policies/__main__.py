@@ -1,8 +1,8 @@
-"""Clones policies and their rivals, runs them, and writes the tables of `docs/policies.md`.
+"""Clones policies and their rivals, runs them, and writes `docs/policies_measured.md`.
 
     python -m examples.policies --robot pendulum --seeds 3
     python -m examples.policies --robot hopper --training "all drops" "no drops" --minutes 10
-    python -m examples.policies --robot pendulum --document docs/policies.md
+    python -m examples.policies --robot pendulum --document docs/policies_measured.md
 
 A file per rival, training and seed is kept in `results/policies/ROBOT`; what is there is not run
 again. It needs `offbeat[robots]`.

@@ -1,7 +1,7 @@
 """Clones the teleoperated arms of a Unitree G1, and scores the actions with frames and hands lost.
 
     python -m examples.policies.arms unitree_g1_lerobot_v21 --minutes 10
-    python -m examples.policies.arms --document docs/policies.md
+    python -m examples.policies.arms --document docs/policies_measured.md
 
 The log is a LeRobot data set of 100 episodes at 30 Hz with 26 joints and 26 actions (it is not part
 of the repository). 70 episodes train, 15 validate, 15 test. A file per rival, training and seed is

@@ -15,11 +15,13 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save_file
+
+from offbeat.data.robots import gymnasium_env
 
 SEARCH = {  # step, directions, kept, noise: the values of the paper's appendix
     "Hopper-v5": (0.01, 8, 4, 0.025),
@@ -61,7 +63,7 @@ class Linear:
 
 
 def episode(
-    env: gymnasium.Env, matrix: NDArray[np.float64], mean: NDArray[np.float64], seed: int
+    env: Any, matrix: NDArray[np.float64], mean: NDArray[np.float64], seed: int
 ) -> tuple[float, float, NDArray[np.float64]]:
     """Return, return without the bonus of being upright, and what was observed."""
     observation, _ = env.reset(seed=seed)
@@ -81,7 +83,7 @@ def episode(
 def search(name: str, folder: Path, minutes: float, seed: int) -> None:
     """Searches for some minutes; keeps the best policy by the mean return of 10 episodes."""
     step, directions, kept, noise = SEARCH[name]
-    env = gymnasium.make(name, disable_env_checker=True)
+    env = gymnasium_env(name, disable_env_checker=True)
     shape = (env.action_space.shape[0], env.observation_space.shape[0])
     policy = Linear(np.zeros(shape), np.zeros(shape[1]), np.zeros(shape[1]))
     state = {"iteration": 0, "steps": 0, "best": -np.inf, "log": []}

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
+from offbeat.data.robots import gymnasium_env
 from offbeat.env import UnevenObservations
 from offbeat.policies import CloneConfig, HeldController, Policy, fit_policy
 
@@ -49,9 +50,7 @@ def filmed(
     controller: Any, robot: Robot, lost: float, steps: int, every: int, size: int
 ) -> list[Image.Image]:
     """Pictures of an episode; the last one is repeated after a fall."""
-    import gymnasium
-
-    made = gymnasium.make(
+    made = gymnasium_env(
         robot.env, render_mode="rgb_array", width=size, height=size, camera_name="track"
     )
     env = UnevenObservations(made, drop=lost)

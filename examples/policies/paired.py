@@ -100,14 +100,15 @@ def table(folder: Path, training: str, condition: str) -> str:
     ]
     for each in found:
         low, high = each.interval
-        start = f"| {each.rival} | {each.difference:.0f} | {low:.0f} to {high:.0f} | "
+        drawn = f"{low:.1f} to {high:.1f}" if each.pairs > 1 else ""
+        start = f"| {each.rival} | {each.difference:.1f} | {drawn} | "
         end = f" | {each.ahead} of {each.pairs} |"
         if each.test is None:
-            lines.append(start + "| | | " + end)
+            lines.append(f"{start}| | |{end}")
             continue
         t, p = each.test.difference_t, each.test.paired_t.p
         lines.append(
-            f"{start}{t.low:.0f} to {t.high:.0f} | {p:.2g} | {next(corrected):.2g} | "
+            f"{start}{t.low:.1f} to {t.high:.1f} | {p:.2g} | {next(corrected):.2g} | "
             f"{each.test.wilcoxon.p:.2g}{end}"
         )
     return "\n".join(lines)

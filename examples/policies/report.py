@@ -48,8 +48,8 @@ def table(folder: Path, training: str) -> str:
 def _line(folder: Path, name: str, returns: dict[str, Any]) -> str:
     entries = []
     for each in returns.values():
-        mean, low, high = interquartile(percent(folder, each))
-        entries.append(f"{mean:.0f}" if len(each) == 1 else f"{mean:.0f} ({low:.0f}–{high:.0f})")
+        mean, low, high = (round(x) for x in interquartile(percent(folder, each)))
+        entries.append(f"{mean}" if len(each) == 1 else f"{mean} ({low}–{high})")
     return f"| {name} | " + " | ".join(entries)
 
 
@@ -84,7 +84,8 @@ def draw(folder: Path, path: Path) -> None:
                 for name in fractions
             ]
             mean, low, high = np.array(each).T
-            axis.plot(lost, mean, color=f"C{i}", marker="o", ms=3, label=rival)
+            width = 2.5 if rival == "anchored" else 1.2
+            axis.plot(lost, mean, color=f"C{i}", marker="o", ms=3, lw=width, label=rival)
             axis.fill_between(lost, low, high, color=f"C{i}", alpha=0.12, lw=0)
         axis.set_title(TITLES[training], fontsize=10)
         axis.set_xlabel("frames lost, %")

@@ -1,7 +1,7 @@
 """Clones handwriting (LASA) from a part of the stamps, and traces it in a closed loop.
 
     python -m examples.policies.shapes --minutes 10
-    python -m examples.policies.shapes --document docs/policies.md
+    python -m examples.policies.shapes --document docs/policies_measured.md
 
 A controller observes a position and gives a velocity, which moves the position until the next row.
 Demonstrations 0 to 4 of a shape are cloned, by 5 the best epoch is chosen, 6 is the test: its

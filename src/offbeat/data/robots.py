@@ -211,11 +211,12 @@ def inside_joint_ranges(speed: float, *, turned: bool = True) -> Draw:
     return draw
 
 
-def gymnasium_env(name: str) -> Any:
+def gymnasium_env(name: str, **options: Any) -> Any:
     """An environment of Gymnasium by its name.
 
     Args:
         name: such as `Hopper-v5`.
+        **options: of `gymnasium.make`.
 
     Raises:
         InputError: there is none of this name.
@@ -224,7 +225,7 @@ def gymnasium_env(name: str) -> Any:
     gymnasium = require("gymnasium", "robots")
     try:
         with _warnings_of_gymnasium(name):
-            return gymnasium.make(name)
+            return gymnasium.make(name, **options)
     except gymnasium.error.DependencyNotInstalled as error:
         raise MissingExtraError(
             f"the environment {name!r} needs a package that is not installed "

@@ -19,6 +19,7 @@ from offbeat.models.base import BaseModel
 from offbeat.models.checkpoint import load_model
 from offbeat.models.elapsed import RecurrentState
 from offbeat.models.model import Model, depends_on_rows
+from offbeat.policies.past import Past, arrays_of, joined, kept, past_of
 from offbeat.stream.transformed import LiveTransforms, TransformState
 
 State = dict[str, NDArray[Any]]
@@ -89,7 +90,7 @@ class Policy:
         self._newest = np.full(n or 1, -np.inf)  # s, of the newest observation
         self._asked = np.full(n or 1, -np.inf)  # s, of the newest action
         self._sent = [self._transforms.start()] * (n or 1)
-        self._past: RecurrentState | Batch | None = None
+        self._past: Past | None = None
         if isinstance(self.model, Model):
             self._past = self.model.empty_state(n or 1)
 
@@ -133,7 +134,7 @@ class Policy:
             )
         chosen, past = self._forward(stamp, values, seen)
         if arrived.any():  # a row in which nothing is observed leaves no trace
-            self._past = _chosen(arrived, past, self._past)
+            self._past = kept(arrived, past, self._past)
         later = asked > stamp
         if later.any():
             then, _ = self._forward(asked, np.zeros_like(values), np.zeros_like(seen))
@@ -175,13 +176,8 @@ class Policy:
 
     def state(self) -> State:
         """The state of the episode as plain arrays; `restore` goes on from it bit for bit."""
-        past, arrays = self._past, {"newest": self._newest.copy(), "asked": self._asked.copy()}
-        for field in fields(past) if past is not None else ():
-            value = getattr(past, field.name)
-            if isinstance(value, Tensor):
-                arrays[field.name] = value.cpu().numpy().copy()
-        if isinstance(past, RecurrentState):
-            arrays["rows"] = np.array(past.rows)
+        arrays = {"newest": self._newest.copy(), "asked": self._asked.copy()}
+        arrays |= arrays_of(self._past)
         for field in fields(TransformState) if not self.model.transforms.is_identity else ():
             arrays[_SENT + field.name] = np.stack([getattr(one, field.name) for one in self._sent])
         return arrays
@@ -201,36 +197,9 @@ class Policy:
         fresh = Policy(self.model, window=self.window)
         fresh.reset(len(newest) if self.n is not None or len(newest) > 1 else None)
         sent = fresh._restored({k: v for k, v in state.items() if k.startswith(_SENT)})
-        others = ("newest", "asked", "rows")
-        names = {k: v for k, v in state.items() if k not in others and not k.startswith(_SENT)}
-        if isinstance(fresh._past, RecurrentState):
-            expected = {
-                f.name: getattr(fresh._past, f.name)
-                for f in fields(fresh._past)
-                if isinstance(getattr(fresh._past, f.name), Tensor)
-            }
-            wrong = expected.keys() ^ names.keys() or [
-                name for name, tensor in expected.items() if tensor.shape != names[name].shape
-            ]
-            if wrong:
-                raise InputError(f"the state is of another model: it differs in {sorted(wrong)}")
-            device = self.model.device
-            parts: dict[str, Any] = {k: torch.tensor(v, device=device) for k, v in names.items()}
-            self._past = replace(fresh._past, rows=int(state["rows"]), **parts)
-        elif names:
-            tensors: dict[str, Any] = {k: torch.tensor(v) for k, v in names.items()}
-            wrong = set(_ROWS) ^ names.keys()
-            if wrong:
-                raise InputError(f"the state is of another model: it differs in {sorted(wrong)}")
-            channels = tensors["values"].shape[-1]
-            if channels != self.model.channels:
-                raise InputError(
-                    f"the state is of a model of {channels} channels, expected "
-                    f"{self.model.channels}; give a state of this policy"
-                )
-            self._past = Batch(**tensors, roles=self.model.roles)
-        else:
-            self._past = None
+        others = {"newest", "asked", *(k for k in state if k.startswith(_SENT))}
+        parts = {k: v for k, v in state.items() if k not in others}
+        self._past = past_of(parts, self.model, fresh._past)
         self.n, self._newest, self._asked = fresh.n, newest.copy(), asked.copy()
         self._sent = sent
 
@@ -304,20 +273,20 @@ class Policy:
         """What the transforms keep of each robot, from `state`."""
         if self.model.transforms.is_identity and not arrays:
             return self._sent
-        kept = {}
+        found = {}
         for field in fields(TransformState):
             value, like = arrays.get(_SENT + field.name), getattr(self._sent[0], field.name)
             if value is None or value.shape != (len(self._sent), *like.shape):
                 raise InputError(f"the state is of another model: it differs in {field.name!r}")
-            kept[field.name] = value.astype(like.dtype)
+            found[field.name] = value.astype(like.dtype)
         return [
-            TransformState(**{name: value[i].copy() for name, value in kept.items()})
+            TransformState(**{name: value[i].copy() for name, value in found.items()})
             for i in range(len(self._sent))
         ]
 
     def _forward(
         self, times: NDArray[np.float64], values: NDArray[np.float64], seen: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], RecurrentState | Batch]:
+    ) -> tuple[NDArray[np.float64], Past]:
         """(n, actions) at a row, and the past after it."""
         model, shape = self.model, (len(times), self.model.channels)
         scaler, acts = model.scaler, self._acts.numpy()
@@ -329,7 +298,7 @@ class Policy:
         clock = torch.from_numpy(times)[:, None].to(model.device)
         valid = torch.ones_like(clock, dtype=torch.bool)
         row = Batch(clock, given, observed, observed, valid, model.roles)
-        past: RecurrentState | Batch
+        past: Past
         with torch.inference_mode():
             if isinstance(model, Model):
                 assert isinstance(self._past, RecurrentState)
@@ -337,47 +306,14 @@ class Policy:
                 past = replace(output.past, actions=None)  # it sees no actions, so none are kept
             else:
                 assert not isinstance(self._past, RecurrentState)
-                past = _joined(self._past, row, self.window)
+                past = joined(self._past, row, self.window)
                 output = model(past)
             chosen = output.mean[:, -1].double().cpu().index_select(1, self._acts).numpy()
         chosen = chosen * scaler.scale[acts] + scaler.shift[acts]
         return np.asarray(np.clip(chosen, self.low, self.high)), past
 
 
-def _joined(past: Batch | None, row: Batch, window: int) -> Batch:
-    """The newest rows of some and a further one."""
-    if past is None:
-        return row
-    parts: dict[str, Any] = {
-        name: torch.cat([getattr(past, name), getattr(row, name)], dim=1)[:, -window:]
-        for name in _ROWS
-    }
-    # A robot that observes nothing may be asked for a time after that of a later observation.
-    parts["times"] = parts["times"].cummax(dim=1).values
-    return replace(row, **parts)
-
-
 _SENT = "transforms."
-_ROWS = ("times", "values", "mask", "known", "valid")
-
-
-def _chosen(
-    arrived: NDArray[np.bool_],
-    after: RecurrentState | Batch,
-    before: RecurrentState | Batch | None,
-) -> RecurrentState | Batch:
-    """The past after a row of the robots that observed something, and that before it of others."""
-    if arrived.all() or not isinstance(before, RecurrentState):
-        return after
-    where = torch.from_numpy(arrived)
-    parts: dict[str, Any] = {}
-    for field in fields(before):
-        new, old = getattr(after, field.name), getattr(before, field.name)
-        if isinstance(old, Tensor):
-            here = where.to(old.device).view(-1, *(1,) * (old.ndim - 1))
-            parts[field.name] = torch.where(here, new, old)
-    assert isinstance(after, RecurrentState)
-    return replace(after, **parts)
 
 
 def _times(name: str, value: ArrayLike, count: int) -> NDArray[np.float64]:
