@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -222,6 +223,18 @@ def test_an_angle_without_a_unit_is_found_by_its_name_and_its_jumps():
     np.testing.assert_allclose(clean[:, 0], 0.8 * times, atol=1e-9)
     np.testing.assert_allclose(clean[:, 1], np.degrees(0.8 * times), atol=1e-7)
     assert "angles" not in plan(data, known=["outliers"]).reader
+
+
+def test_states_that_are_named_like_actions_are_noted():
+    times = np.arange(0, 60, 0.01)
+    values = np.column_stack([np.sin(times), np.cos(times), np.sin(2 * times)])
+    one = ob.Trajectory(times, values, names=("state", "action.0", "action.1"))
+    (said,) = [note for note in plan(ob.Dataset((one,))).notes if "like actions" in note]
+    assert "action.0, action.1; --reader.actions=[action.0,action.1] makes them actions" in said
+    given = replace(one, roles=("state", "action", "action"))
+    assert not any("like actions" in note for note in plan(ob.Dataset((given,))).notes)
+    other = replace(one, names=("state", "traction", "interaction"))
+    assert not any("like actions" in note for note in plan(ob.Dataset((other,))).notes)
 
 
 def test_the_heading_of_a_slow_log_says_how_long_it_is_and_how_far_rows_are_apart():

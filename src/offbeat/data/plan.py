@@ -33,6 +33,8 @@ _ANGLE = re.compile(
 )
 """Names of channels that are angles where they jump like one."""
 
+_ACTION = re.compile(r"actions?(?:$|[._\[/])", re.IGNORECASE)
+
 _FEWEST_ROWS = 24
 _FEWEST_EPISODES = 10  # for a split by trajectory
 _LONGEST_HORIZON_S = 1.0
@@ -297,6 +299,17 @@ def _reader(
         notes.append(
             f"angles that jump by a full turn: {listed(wrapping)}; they are unwrapped, and given "
             "back wrapped (--reader.angles=[] leaves them as they are)"
+        )
+    named = [
+        name
+        for name, role in zip(dataset.names, dataset.roles, strict=True)
+        if role == STATE and _ACTION.match(name)
+    ]
+    if named and "actions" not in options and len(named) < dataset.channels:
+        notes.append(
+            f"named like actions, and learned as states: {listed(named)}; "
+            f"--reader.actions=[{','.join(named[:2])}{',...' if len(named) > 2 else ''}] makes "
+            "them actions, which a LeRobot data set has by themselves"
         )
     return options, notes
 
