@@ -110,6 +110,17 @@ def write_ardupilot(path, stamps, values):
     return path.with_suffix(".log")
 
 
+def write_plain_hdf5(path, stamps, values):
+    """Arrays beside their times, in a group."""
+    import h5py
+
+    with h5py.File(path.with_suffix(".h5"), "w") as file:
+        file["walk/time_ns"] = np.asarray(stamps)
+        file["walk/joints"] = values
+        file["walk/joints"].attrs["names"] = ["hip", "knee"]
+    return path.with_suffix(".h5")
+
+
 def write_tum(path, stamps, values):
     """Poses whose first two coordinates are the walk."""
     lines = ["# timestamp tx ty tz qx qy qz qw"]
@@ -180,6 +191,7 @@ except ImportError:
     pass
 else:
     WRITERS |= robot_logs.SAME_WALK
+    WRITERS["hdf5 plain"] = write_plain_hdf5
     WRITERS["hdf5 robomimic written"] = written("robomimic", ".hdf5")
     WRITERS["hdf5 minari written"] = written("minari", "")
     WRITERS["ros mcap written"] = written("mcap", ".mcap")

@@ -23,6 +23,7 @@ _NAMES = ("names", "channels", "columns")
 _SPECIAL = (*_NAMES, "units")
 _SAMPLE = 1000
 _EPISODE = "episode"
+_LARGEST_MATRIX = 36  # numbers of a matrix per row
 
 
 def recordings_of(
@@ -47,6 +48,7 @@ def recordings_of(
         InputError: an option names an unknown array or unit.
     """
     arrays, channels = dict(arrays), options.channels
+    turned: list[str] = []
     for name, array in arrays.items():
         column = array.shape[1:] == (1,) and len(array) > 1 and options.time_column in (None, name)
         if column and time_column_of([name]):
@@ -59,6 +61,10 @@ def recordings_of(
             f"{path} has times of shape {array.shape} and type {array.dtype} in {stamp.time!r}, "
             "expected numbers of shape (rows,) or (episodes, rows)"
         )
+    for name, array in arrays.items():
+        if len(shape) == 1 and name != stamp.time and array.shape[1:] == shape != array.shape[:1]:
+            arrays[name] = array.T
+            turned.append(name)
     clock, unit, notes, found = _clock(path, arrays, stamp, shape, options, time_unit)
     beside = [name for name in beside if name in arrays and channels is None]
     rest = {name: array for name, array in arrays.items() if name not in beside}
@@ -71,6 +77,8 @@ def recordings_of(
             f"{path} has no array with a row for each of the {shape} times in {stamp.time!r}, "
             f"besides them it has {shapes}"
         )
+    if turned:
+        notes = (*notes, f"arrays with a column per time are turned: {listed(turned, quoted=True)}")
     if beside:
         notes = (*notes, "masks and intervals are left out")
     elif left:
@@ -237,6 +245,7 @@ def _table(
         and array.shape[:axes] == shape
         and (
             (array.dtype.kind in "biuf" and array.ndim <= axes + 1)
+            or (array.dtype.kind in "biuf" and array.ndim == axes + 2 and _is_small(array, axes))
             or (array.dtype.kind in "SU" and array.ndim == axes == 1 and name not in _SPECIAL)
         )
     }
@@ -247,6 +256,10 @@ def _table(
     for name, array in fitting.items():
         if array.ndim == axes:
             own, columns = [name], [array]
+        elif array.ndim == axes + 2:
+            places = list(np.ndindex(array.shape[axes:]))
+            own = [f"{name}.{i}.{j}" for i, j in places]
+            columns = [array[..., i, j] for i, j in places]
         else:
             width = array.shape[-1]
             own = [f"{name}.{i}" for i in range(width)]
@@ -273,6 +286,11 @@ def _table(
             table[channel] = column
     left = [n for n in arrays if n not in fitting and n not in used and n not in stamp]
     return table, stated, left
+
+
+def _is_small(array: NDArray[Any], axes: int) -> bool:
+    """Whether each row is a small matrix, as of a rotation or a covariance, and no picture."""
+    return 0 < int(np.prod(array.shape[axes:])) <= _LARGEST_MATRIX
 
 
 def _by_episode(

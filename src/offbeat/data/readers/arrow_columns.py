@@ -21,6 +21,7 @@ from offbeat.data.readers.batches import (
     line_error,
 )
 from offbeat.data.readers.columns import Columns, TableOptions, columns_in, unit_written
+from offbeat.data.readers.csv_fields import MISSING, number_in
 from offbeat.data.readers.gathered import recordings
 from offbeat.data.readers.stamps import EXAMPLE, form_in
 from offbeat.data.recording import Recording
@@ -129,20 +130,19 @@ def recordings_of(
         notes: tuple[str, ...] = ()
         found = False
         kind = schema.field(columns.time).type if columns.time else None
-        of_text = columns.time and is_text(kind)
+        of_text = columns.time and is_text(kind) and sample.is_text(columns.time)
         form = _form(path, columns, sample, options.day_first) if of_text else None
         shown = ""
         of_clock: Callable[[str], Iterator[Any]] = chunks
-        if not columns.time or columns.rest or is_text(kind) or _is_day(kind):
+        if not columns.time or columns.rest or of_text or _is_day(kind):
             unit = "ns"
         elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
             unit = str(schema.field(columns.time).type.unit)
         else:
-            numbers = next(chunks(columns.time)).drop_null()
-            numbers = numbers.cast(pa.float64(), safe=False).to_numpy()
+            numbers = sample.numbers(columns.time)
             time_unit = time_unit or unit_written(schema.names, columns.time)
             unit, notes, found = state_time_unit(time_unit, columns.time, numbers, str(path))
-            if pa.types.is_decimal(kind):
+            if pa.types.is_decimal(kind) or is_text(kind):
                 shown, unit, of_clock = unit, *_decimals(unit, chunks)
         if index is not None and columns.time == index:
             notes = (*notes, "the index of pandas is taken for the time")
@@ -195,6 +195,9 @@ class ArrowSample:
             pa.types.is_decimal,
             pa.types.is_null,
         )
+        if is_text(kind):
+            known = [text for text in self.texts(name) if text.strip() not in MISSING]
+            return not known or any(number_in(text, ".") is None for text in known)
         return not any(fits(kind) for fits in numbers)
 
     def numbers(self, name: str) -> NDArray[np.float64]:
@@ -203,6 +206,9 @@ class ArrowSample:
 
         if self.is_text(name) or is_list(self.schema.field(name).type):
             return np.zeros(0)
+        if is_text(self.schema.field(name).type):
+            found = [number_in(text, ".") for text in self.texts(name)]
+            return np.array([np.nan if n is None else n for n in found], dtype=np.float64)
         numbers: NDArray[np.float64] = (
             self._first(name).cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
         )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import join_stamp
 from offbeat.data.readers.columns import Columns
+from offbeat.data.readers.csv_fields import MISSING
 from offbeat.data.readers.gathered import Coded, Coder, Gathered
 from offbeat.data.readers.stamps import date_and_time, over_midnight, stamps_of
 from offbeat.errors import FileFormatError
@@ -224,6 +225,8 @@ def _put(out: NDArray[np.float64], column: Any) -> None:
     """Copies a column of numbers, null = NaN."""
     import pyarrow as pa
 
+    if is_text(column.type):
+        column = _numbers_of(column)
     if not pa.types.is_float64(column.type):
         column = column.cast(pa.float64(), safe=False)
     if column.null_count == len(column):
@@ -234,6 +237,26 @@ def _put(out: NDArray[np.float64], column: Any) -> None:
     if column.null_count:
         bits = np.unpackbits(np.frombuffer(known, np.uint8), bitorder="little")
         out[np.flatnonzero(bits[column.offset :][: len(column)] == 0)] = np.nan
+
+
+def _numbers_of(column: Any) -> Any:
+    """Numbers of a column of texts, null where one is missing.
+
+    Raises:
+        FileFormatError: a text is no number.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    texts = pc.utf8_trim_whitespace(_text(column))
+    texts = pc.if_else(pc.is_in(texts, pa.array(MISSING)), pa.scalar(None, pa.string()), texts)
+    try:
+        return texts.cast(pa.float64())
+    except pa.ArrowInvalid as error:
+        raise FileFormatError(
+            f"numbers as texts, and another text ({' '.join(str(error).split())[:90]}); leave that "
+            "column out with without="
+        ) from None
 
 
 def _lists(column: Any, name: str, width: int) -> NDArray[Any]:

@@ -9,9 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from offbeat.data.cleaning.clocks import split_stamps, split_unit, time_column_of
+from offbeat.data.cleaning.clocks import may_be_time, split_stamps, split_unit, time_column_of
 from offbeat.data.readers.arrays import recordings_of
 from offbeat.data.readers.columns import TableOptions, columns_in
 from offbeat.data.recording import Recording
@@ -56,6 +57,8 @@ def recordings_of_groups(
         made = recordings_of(path, _columns(kept), options)
         return _noted(path, made, [*left, *(n for n in leaves if n not in kept)], label)
     clocks = _clocks(path, leaves, options.time_column)
+    rows_of = {rows for rows, _ in clocks.values()}
+    leaves, turned = _turned(leaves, rows_of)
     of_clock: dict[str, dict[str, NDArray[Any]]] = {group: {} for group in clocks}
     left = list(left)
     for name, array in leaves.items():
@@ -75,9 +78,18 @@ def recordings_of_groups(
     for group, arrays in parts.items():
         chosen = replace(options, time_column=list(clocks[group][1]))
         parsed[group] = recordings_of(path, _columns(arrays), chosen, time_unit)
-    if len(parsed) == 1:
-        return _noted(path, next(iter(parsed.values())), left, label)
-    return _noted(path, [_merged(path, parsed)], left, label)
+    made = next(iter(parsed.values())) if len(parsed) == 1 else [_merged(path, parsed)]
+    return _noted(path, made, left, label, turned)
+
+
+def _turned(leaves: Leaves, rows: set[int]) -> tuple[Leaves, list[str]]:
+    """The arrays with a row per time, and the names of those that had a column per time."""
+    turned = [
+        name
+        for name, array in leaves.items()
+        if array.ndim == 2 and len(array) not in rows and array.shape[1] in rows
+    ]
+    return {n: array.T if n in turned else array for n, array in leaves.items()}, turned
 
 
 def _joined(group: str, name: str) -> str:
@@ -106,6 +118,11 @@ def _clocks(path: Path, leaves: Leaves, given: Any) -> dict[str, tuple[int, tupl
             stamp = pair or ((usual,) if usual is not None else ())
         if stamp:
             found[group] = (len(leaves[_joined(group, stamp[0])]), tuple(stamp))
+    if not found and given is None:  # one that is named like a time, and increases
+        for group, names in of_group.items():
+            likely = [n for n in names if may_be_time(n) and _grows(leaves[_joined(group, n)])]
+            if len(likely) == 1:
+                found[group] = (len(leaves[_joined(group, likely[0])]), (likely[0],))
     if not found and given is not None:
         one_of("time_column", str(given), list(leaves))
     if not found:
@@ -115,6 +132,11 @@ def _clocks(path: Path, leaves: Leaves, given: Any) -> dict[str, tuple[int, tupl
             "rate_hz="
         )
     return found
+
+
+def _grows(array: NDArray[Any]) -> bool:
+    numbers = array.dtype.kind in "iuf" and len(array) > 1
+    return numbers and bool((np.diff(array[:1000].astype(np.float64)) > 0).all())
 
 
 def _clock_of(
@@ -182,13 +204,18 @@ def _merged(path: Path, parsed: Mapping[str, list[Recording]]) -> Recording:
     )
 
 
-def _noted(path: Path, made: list[Recording], left: list[str], label: str) -> list[Recording]:
+def _noted(
+    path: Path,
+    made: list[Recording],
+    left: list[str],
+    label: str,
+    turned: Sequence[str] = (),
+) -> list[Recording]:
     """Recordings with actions, a label, and a note on what was left out."""
-    notes = (
-        (f"left out, as they are no numbers, or no times have as many rows: {listed(left)}",)
-        if left
-        else ()
-    )
+    why = "they are no numbers, or no times have as many rows"
+    notes = [f"left out, as {why}: {listed(left)}"] if left else []
+    if turned:
+        notes.append(f"arrays with a column per time are turned: {listed(turned, quoted=True)}")
     return [
         replace(
             one,

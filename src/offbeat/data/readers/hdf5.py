@@ -117,8 +117,11 @@ def recordings(
         path = inside[0]
     path = require_file(path)
     with opened(path) as file:
-        robomimic = "data" in file and any(map(_EPISODE.fullmatch, file["data"]))
-        root = file["data"] if robomimic else file
+        inside = any(map(_EPISODE.fullmatch, _names_in(file, "data")))
+        root = file["data"] if inside else file
+        robomimic = inside or any(
+            "obs" in _names_in(root, name) for name in root if _EPISODE.fullmatch(name)
+        )
         episodes = sorted(
             (name for name in root if _EPISODE.fullmatch(name)),
             key=lambda name: int(name.rpartition("_")[2]),
@@ -155,9 +158,17 @@ def recordings(
 _TIMED = ("stamps are the array", "stamps are joined")  # notes of episodes that have times
 
 
+def _names_in(node: Any, name: str) -> list[str]:
+    """The names in a group of a group; none if it is no group."""
+    import h5py
+
+    inner = node.get(name)
+    return list(inner) if isinstance(inner, h5py.Group) else []
+
+
 def _are_learned(root: Any, episodes: list[str]) -> bool:
     """Whether groups are episodes of Minari, which have observations or actions."""
-    return any("observations" in root[name] or "actions" in root[name] for name in episodes[:2])
+    return any({"observations", "actions"} & {*_names_in(root, name)} for name in episodes[:2])
 
 
 def _masked(file: Any, mask: str, names: list[str], path: Path) -> list[str]:

@@ -27,6 +27,7 @@ from offbeat.data.readers.hdf5_file import (
     leaves_of,
     member,
     refuse_objects,
+    texts_in,
     what_is,
 )
 from offbeat.data.recording import Recording
@@ -47,6 +48,9 @@ _BESIDE = (*_ENDS, "rewards", "reward", "next_observations", "infos", "metadata"
 """Arrays of D4RL that are no states."""
 
 _LABEL = "episode"
+_RATES = ("rate_hz", "rate", "sample_rate", "sampling_rate", "sampling_frequency", "fs", "hz",
+          "fps", "frequency", "control_freq")  # fmt: skip
+_STEPS = ("dt", "timestep", "time_step", "sample_time", "sampling_time")
 
 
 def plain_recordings(
@@ -89,7 +93,11 @@ def plain_recordings(
                 f"{path} holds no array of numbers{f' in {name}' if name else ''}; it has: "
                 f"{listed(left) or 'nothing'}"
             )
-        yield from _recordings(path, leaves, left, name, rate_hz, time_column, time_unit)
+        rate, note = rate_hz, ""
+        if rate_hz is None and time_column is None and not _has_times(leaves):
+            rate, note = _rate_in(file, member(root, name, path) if name else root)
+        for made in _recordings(path, leaves, left, name, rate, time_column, time_unit):
+            yield replace(made, notes=(note, *made.notes[1:])) if note else made
 
 
 def _recordings(
@@ -131,6 +139,30 @@ def _recordings(
 def _replaced(made: Recording, notes: tuple[str, ...], left: list[str]) -> Recording:
     gone = [name.partition(" ")[0] for name in left]
     return replace(made, notes=notes, left_out=(*made.left_out, *gone))
+
+
+def _rate_in(*nodes: Any) -> tuple[float | None, str]:
+    """The rate in attributes or single numbers of groups, or of what is in them, and a note."""
+    import h5py
+
+    inside = [one for node in nodes for one in node.values() if hasattr(one, "attrs")]
+    for node in (*nodes, *inside[:_MOST_ARRAYS]):
+        numbers = {
+            name: value[()]
+            for name, value in (node.items() if isinstance(node, h5py.Group) else ())
+            if isinstance(value, h5py.Dataset) and not value.ndim and value.dtype.kind in "iuf"
+        }
+        for name, value in {**numbers, **dict(node.attrs)}.items():
+            number = np.asarray(value)
+            if number.size != 1 or number.dtype.kind not in "iuf":
+                continue
+            found = float(number.reshape(()))
+            rate = found if name.casefold() in _RATES else 0.0
+            if name.casefold() in _STEPS and found > 0:
+                rate = 1 / found
+            if 0 < rate <= 1e9:
+                return rate, f"stamps are row number / {rate:g} Hz, as {name!r} says"
+    return None, ""
 
 
 def _has_times(leaves: Mapping[str, NDArray[Any]]) -> bool:
@@ -204,6 +236,8 @@ def _arrays(
         values = _values(dataset)
         if values.dtype.names:
             found |= {f"{name}/{field}": values[field] for field in values.dtype.names}
+        elif values.ndim == 2 and (named := _names_of(dataset, values.shape[1])):
+            found |= {f"{name}/{n}": values[:, i] for i, n in enumerate(named)}
         else:
             found[_with_unit(name, dataset)] = values
     tops = {_top(name) for name in found}
@@ -241,6 +275,15 @@ def _values(dataset: Any) -> NDArray[Any]:
 
 def _is_matlab(dataset: Any) -> bool:
     return "MATLAB_class" in dataset.attrs
+
+
+def _names_of(dataset: Any, width: int) -> list[str]:
+    """The names of the columns of a matrix, in one of its attributes; none if it has none."""
+    for attribute in ("names", "columns", "channels", "labels", "fields"):
+        named = texts_in(dataset, attribute, width)
+        if named and len(set(named)) == width and all(named):
+            return [name.replace("/", ".") for name in named]
+    return []
 
 
 def _with_unit(name: str, dataset: Any) -> str:

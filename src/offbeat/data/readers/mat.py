@@ -67,11 +67,6 @@ def read_mat(
             f"{path} holds no array of numbers; it has: {listed(left) or 'nothing'}; objects such "
             "as timeseries and table must be saved as arrays: t = x.Time; y = x.Data"
         )
-    rows = {len(array) for array in leaves.values() if array.ndim == 1}
-    leaves = {
-        name: array.T if array.ndim == 2 and len(array) not in rows and array.shape[1] in rows else
-        array for name, array in leaves.items()
-    }  # fmt: skip
     return recordings_of_groups(path, leaves, options, time_unit, left=left)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +105,14 @@ def _check_size(path: Path) -> None:
     require_memory(path, 2 * size, f"{size} bytes of arrays")
 
 
+def _spread(path: Path, name: str, array: Any) -> Iterator[tuple[str, Any]]:
+    """An array, or those of its fields."""
+    if isinstance(array, np.ndarray) and array.dtype.names:
+        yield from ((f"{name}.{field}", part) for field, part in _fields(path, array).items())
+    else:
+        yield name, array
+
+
 def _fields(path: Path, array: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """The fields of a structured array, as arrays by name."""
     names = array.dtype.names
@@ -130,6 +138,7 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
                 return _fields(path, file)
             with file:
                 arrays = {name: file[name] for name in file.files}
+            arrays = {n: a for name, array in arrays.items() for n, a in _spread(path, name, array)}
         for name, array in arrays.items():
             if not isinstance(array, np.ndarray):
                 raise FileFormatError(
