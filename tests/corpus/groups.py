@@ -16,8 +16,9 @@ def _written(path, arrays, attributes=None):
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
             file[name] = values
-        for name, unit in (attributes or {}).items():
-            file[name].attrs["units"] = unit
+        for name, given in (attributes or {}).items():
+            attribute, value = given if isinstance(given, tuple) else ("units", given)
+            file[name].attrs[attribute] = value
     return path
 
 
@@ -57,13 +58,30 @@ HDF5 = {
         {},
         ("x", "y"),
     ),
+    "a matrix with names of its columns": (
+        {"log": np.column_stack([TIMES, XY])},
+        {"log": ("columns", ["time", "x", "y"])},
+        ("x", "y"),
+    ),
+    "times whose name ends like one": (
+        {"ts_us": (20_000 * np.arange(ROWS)).astype(np.uint64), "x": X, "y": Y},
+        {},
+        ("x", "y"),
+    ),
+    "a rate in an attribute": (
+        {"data/x": X, "data/y": Y},
+        {"data": ("sample_rate", 50)},
+        ("x", "y"),
+    ),
+    "a step in a number": ({"x": X, "y": Y, "dt": 0.02}, {}, ("x", "y")),
+    "a column per time": ({"time": TIMES, "q": XY.T}, {}, ("q[0]", "q[1]")),
     "columns of shape (rows, 1)": (
         {"time": TIMES[:, None], "x": X[:, None], "y": Y[:, None]},
         {},
         ("x", "y"),
     ),
 }
-"""Arrays, units in attributes, and the names of the channels that hold X and Y."""
+"""Arrays, attributes (units, or a name and a value), and the channels that hold X and Y."""
 
 
 def of_kind(path, kind):

@@ -28,7 +28,7 @@ Columns = Mapping[str, Sequence[Any]]
 
 def write_csv(path: Path, columns: Columns, *, delimiter: str = ",") -> Path:
     """A header and rows; None and NaN are empty fields."""
-    lines = [delimiter.join(columns)]
+    lines = [delimiter.join(_field(name, delimiter) for name in columns)]
     lines += [
         delimiter.join(_field(v, delimiter) for v in row)
         for row in zip(*columns.values(), strict=True)
@@ -211,6 +211,28 @@ KINDS: dict[str, Kind] = {
     ),
     "milliseconds of a week of u-blox": Kind(
         {"iTOW": 345_600_000 + 1000 * np.arange(ROWS), **XY}, XY, times=ONES
+    ),
+    "a name that ends like one of times": Kind(
+        {"sim_time_s": TIMES, **XY}, XY, note="it alone is named like one, and increases"
+    ),
+    "a unit behind a comma": Kind({"time, ms": 20 * np.arange(ROWS), **XY}, XY),
+    "numbers as texts": Kind(
+        {"time": [f"{t:.2f}" for t in TIMES], "x": [str(x) for x in X], "y": Y},
+        XY,
+        formats=("csv", "parquet"),
+    ),
+    "a column per time": Kind(
+        {"time": TIMES, "q": [X, Y]}, {"q.0": X, "q.1": Y}, formats=("npz",), note="are turned: 'q'"
+    ),
+    "a matrix per time": Kind(
+        {"time": TIMES, "R": np.stack([X, Y, Y, X], axis=1).reshape(ROWS, 2, 2)},
+        {"R.0.0": X, "R.0.1": Y, "R.1.0": Y, "R.1.1": X},
+        formats=("npz",),
+    ),
+    "fields of records": Kind(
+        {"log": np.rec.fromarrays([TIMES, X], names=["time", "x"]), "y": Y},
+        {"log.x": X, "y": Y},
+        formats=("npz",),
     ),
     "milliseconds in brackets without a blank": Kind(
         {"time(ms)": 20 * np.arange(ROWS), "angle(deg)": X, "x[0]": Y},

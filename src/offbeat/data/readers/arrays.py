@@ -112,7 +112,11 @@ def recordings_of(
     times = {name: clock if len(shape) == 2 else arrays[name] for name in stamps}
     sample = ArraySample({**times, **table})
     columns = Columns.of(path, [*stamps, *table], options, sample)
-    columns = replace(columns, left_out=(*columns.left_out, *left, *gone))
+    columns = replace(
+        columns,
+        left_out=(*columns.left_out, *left, *gone),
+        notes=tuple(dict.fromkeys((*stamp.notes, *columns.notes))),
+    )
     values = np.stack([table[name].astype(np.float64) for name in columns.channels])
     gathered = Gathered(clock, _coded(table, columns.label), _coded(table, columns.key), values.T)
     return recordings(path, columns, unit, notes, gathered, found=found)
