@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as hnp
 
 from offbeat.data.cleaning.clocks import TIME_NAMES
 from offbeat.data.readers import READERS, read, register_reader
-from offbeat.data.readers.columns import LABEL_NAMES
 from offbeat.data.readers.csv_fields import MISSING
+from offbeat.data.readers.table_options import LABEL_NAMES
 from offbeat.data.store import save
 from offbeat.data.trajectory import Dataset, Trajectory
 from offbeat.data.writers.tables import write_table

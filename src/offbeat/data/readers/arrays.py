@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import join_stamp, split_unit, state_time_unit, time_column_of
-from offbeat.data.readers.columns import LABEL_NAMES, Columns, TableOptions, stamp_columns
+from offbeat.data.readers.columns import Columns
 from offbeat.data.readers.gathered import Coded, Coder, Gathered, recordings
+from offbeat.data.readers.stamp_columns import Stamp, stamp_columns
 from offbeat.data.readers.stamps import date_and_time, form_in, over_midnight, stamps_of
+from offbeat.data.readers.table_options import LABEL_NAMES, TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS
 from offbeat.errors import FileFormatError, listed, one_of
@@ -154,7 +156,7 @@ def _most_common_length(arrays: Mapping[str, NDArray[Any]]) -> tuple[int, ...]:
 def _clock(
     path: Path,
     arrays: Mapping[str, NDArray[Any]],
-    stamp: Columns,
+    stamp: Stamp,
     shape: tuple[int, ...],
     options: TableOptions,
     time_unit: str | None,
@@ -181,7 +183,7 @@ def _clock(
 
 
 def _of_texts(
-    path: Path, stamp: Columns, arrays: Mapping[str, NDArray[Any]], day_first: bool | None
+    path: Path, stamp: Stamp, arrays: Mapping[str, NDArray[Any]], day_first: bool | None
 ) -> NDArray[Any]:
     import pyarrow as pa
 

@@ -20,10 +20,12 @@ from offbeat.data.readers.batches import (
     is_text,
     line_error,
 )
-from offbeat.data.readers.columns import Columns, TableOptions, columns_in, unit_written
+from offbeat.data.readers.columns import Columns, unit_written
 from offbeat.data.readers.csv_fields import MISSING, number_in
 from offbeat.data.readers.gathered import recordings
+from offbeat.data.readers.stamp_columns import columns_in
 from offbeat.data.readers.stamps import EXAMPLE, form_in
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS
 from offbeat.errors import FileFormatError, NoLogError

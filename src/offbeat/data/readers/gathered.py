@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import to_nanoseconds
 from offbeat.data.cleaning.odd_clocks import without_wraps
-from offbeat.data.readers.columns import VALUE_NAMES, Columns
+from offbeat.data.readers.columns import Columns
+from offbeat.data.readers.table_options import VALUE_NAMES
 from offbeat.data.recording import Recording, Signal
 from offbeat.data.signals import MOST_CHANNELS
 from offbeat.errors import FileFormatError, one_of

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import may_be_time, split_stamps, split_unit, time_column_of
 from offbeat.data.readers.arrays import recordings_of
-from offbeat.data.readers.columns import TableOptions, columns_in
+from offbeat.data.readers.stamp_columns import columns_in
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.signals import Signal
 from offbeat.errors import FileFormatError, NoLogError, listed, one_of

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import time_column_of
-from offbeat.data.readers.columns import TableOptions
 from offbeat.data.readers.groups import recordings_of_groups
 from offbeat.data.readers.hdf5_file import (
     check_storage,
@@ -30,6 +29,7 @@ from offbeat.data.readers.hdf5_file import (
     texts_in,
     what_is,
 )
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.errors import FileFormatError, listed, one_of
 

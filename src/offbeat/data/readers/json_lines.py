@@ -13,8 +13,8 @@ import numpy as np
 from offbeat.data.cleaning.clocks import time_column_of
 from offbeat.data.memory import require_memory, require_rows
 from offbeat.data.readers.arrow_columns import TableSource, recordings_of
-from offbeat.data.readers.columns import LABEL_NAMES, TableOptions
 from offbeat.data.readers.csv_fields import MISSING, number_in
+from offbeat.data.readers.table_options import LABEL_NAMES, TableOptions
 from offbeat.data.readers.text import TextFile, start_of
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS

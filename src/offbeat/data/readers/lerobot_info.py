@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data.cleaning.clocks import split_stamps, time_column_of
-from offbeat.data.readers.columns import columns_in
 from offbeat.data.readers.options import names
+from offbeat.data.readers.stamp_columns import columns_in
 from offbeat.data.source import inside, read_json, require_file
 from offbeat.errors import FileFormatError, InputError, listed, one_of
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from offbeat.data.memory import require_memory
 from offbeat.data.readers import hdf5
-from offbeat.data.readers.columns import TableOptions
 from offbeat.data.readers.groups import recordings_of_groups
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
 from offbeat.errors import FileFormatError, listed

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.arrays import recordings_of
-from offbeat.data.readers.columns import TableOptions
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file, starts_with
 from offbeat.errors import FileFormatError

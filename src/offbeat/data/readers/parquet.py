@@ -10,7 +10,7 @@ from typing import Any
 
 from offbeat.data.memory import require_memory
 from offbeat.data.readers.arrow_columns import Chunks, TableSource, damaged, recordings_of
-from offbeat.data.readers.columns import TableOptions
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from offbeat.data.memory import require_memory
-from offbeat.data.readers.columns import TableOptions
 from offbeat.data.readers.json_lines import recordings_of_rows
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.readers.text import TextFile, start_of
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file

@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from offbeat.data.cleaning.clocks import state_time_unit
-from offbeat.data.readers.columns import Columns, TableOptions, unit_written
+from offbeat.data.readers.columns import Columns, unit_written
 from offbeat.data.readers.csv_fields import MISSING
-from offbeat.data.readers.csv_file import CsvFile, CsvSample
+from offbeat.data.readers.csv_file import CsvFile
 from offbeat.data.readers.csv_layout import find_csv_layout
+from offbeat.data.readers.csv_lines import CsvSample
 from offbeat.data.readers.gathered import recordings
 from offbeat.data.readers.options import names as names_of
+from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.readers.text import TextFile
 from offbeat.data.recording import Recording
 from offbeat.data.signals import MOST_CHANNELS
