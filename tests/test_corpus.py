@@ -126,6 +126,14 @@ def test_logs_that_are_joined_are_an_episode_each(tmp_path):
         read(tmp_path / "log.csv")
 
 
+@pytest.mark.parametrize("blank", [" ", "'", "\u2019", "\u00a0", "\u202f"])
+def test_thousands_may_be_apart_and_a_minus_that_of_mathematics(blank, tmp_path):
+    rows = [f"{i};\u22121{blank}{i:03d}{blank}500.25;{i}" for i in range(40)]
+    (tmp_path / "log.csv").write_text("time_ms;x;y\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    column = read(tmp_path / "log.csv")[0].values[:, 0]
+    assert column.tolist() == [-(1_000_500.25 + 1000 * i) for i in range(40)]
+
+
 @pytest.mark.parametrize("text", tables.MISSING_TEXTS)
 def test_a_marker_of_a_missing_value_is_one_wherever_it_is(text, tmp_path):
     rows = [f"{t:.2f},{x},1" for t, x in zip(tables.TIMES, tables.X, strict=True)]

@@ -304,6 +304,17 @@ KINDS: dict[str, Kind] = {
         {"_time": np.repeat(TIMES, 2), "_field": ["a", "b"] * ROWS, "_value": TWO["GyrX"]},
         {"a": X, "b": Y},
     ),
+    "the answer to a query of InfluxDB": Kind(
+        {
+            "result": ["_result"] * 2 * ROWS,
+            "table": np.repeat([0, 1], ROWS),
+            "_time": np.tile(TIMES, 2),
+            "_value": np.concatenate([X, Y]),
+            "_field": np.repeat(["a", "b"], ROWS),
+            "_measurement": ["imu"] * 2 * ROWS,
+        },
+        {"a": X, "b": Y},
+    ),
     "texts that take turns without a common stamp": Kind(
         {"time": TIMES, "mac": ["a1", "b2"] * (ROWS // 2), **XY},
         XY,

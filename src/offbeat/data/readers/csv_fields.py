@@ -19,6 +19,7 @@ MISSING = (
 )
 """Fields whose value is not known."""
 
+_MINUS = "\u2212"  # the sign of mathematics
 BOOLEANS = ("true", "false", "True", "False", "TRUE", "FALSE")
 SWITCHES = {"yes": 1, "no": 0, "on": 1, "off": 0}
 """Words for 1 and 0, in any case, in a column that holds no others."""
@@ -31,6 +32,10 @@ _INFINITE = r"^([+-]?)1\.#(INF|inf).*$"
 _THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
 GROUPED_BY_POINTS = re.compile(r"[+-]?[1-9][0-9]{0,2}(\.[0-9]{3})+,[0-9]+")
 """Numbers with a decimal comma, and a point for each thousand."""
+
+_APART = " '\u2019\u00a0\u2009\u202f"
+_GROUPED_BY_OTHERS = rf"^([+-]?[1-9][0-9]{{0,2}})((?:[{_APART}][0-9]{{3}})+)((?:\.[0-9]*)?)$"
+"""Numbers with a blank or an apostrophe for each thousand."""
 
 _GROUPED_BY_COMMAS = re.compile(_THOUSANDS)
 
@@ -69,6 +74,10 @@ def number_in(text: str, decimal: str) -> float | None:
         number = float(text)
     except ValueError:
         text = text.strip()
+        if text[:1] == _MINUS:
+            return number_in(f"-{text[1:]}", ".")
+        if grouped := re.match(_GROUPED_BY_OTHERS, text):
+            return float(f"{grouped[1]}{re.sub('[^0-9]', '', grouped[2])}{grouped[3]}")
         if infinite := re.match(_INFINITE, text):
             return float(f"{infinite[1]}inf")
         if fortran := re.match(_FORTRAN, text):
@@ -160,6 +169,11 @@ class Converter:
                 pa.string(),
             )
         texts = pc.replace_substring_regex(texts, _INFINITE, r"\1inf")
+        texts = pc.replace_substring_regex(texts, f"^{_MINUS}", "-")
+        grouped = pc.fill_null(pc.match_substring_regex(texts, _GROUPED_BY_OTHERS), False)
+        if pc.any(grouped).as_py():
+            plain = pc.replace_substring_regex(texts, "[^0-9.+-]", "")
+            texts = pc.if_else(grouped, plain, texts)
         if self.decimal == "." and self.thousands:
             grouped = pc.match_substring_regex(texts, _THOUSANDS)
             texts = pc.if_else(grouped, pc.replace_substring(texts, ",", ""), texts)

@@ -42,6 +42,8 @@ def long_form(
     keys = [first_of[name] for name in KEY_NAMES if name in first_of]
     values = [first_of[name] for name in VALUE_NAMES if name in first_of]
     channel_column, value_column = options.channel_column, options.value_column
+    if channel_column is None and value_column is None and {"_field", "_value"} <= set(rest):
+        return "_field", "_value"  # of InfluxDB, beside columns about the query
     if channel_column is None and value_column is None:
         if not (len(rest) == 2 and len(keys) == len(values) == 1):
             return None, None
