@@ -112,9 +112,7 @@ def stamp_columns(
         name
         for name in names
         if may_be_time(name)
-        and (
-            _increases(sample.numbers(name)) or form_of(first_known(sample.texts(name))) is not None
-        )
+        and (_increases(sample.numbers(name)) or _are_times(sample.texts(name)))
     ]
     if not pairs and len(likely) == 1:
         return made(likely[0], note=f"{likely[0]!r} is taken for the time: it alone is named like "
