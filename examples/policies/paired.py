@@ -100,15 +100,26 @@ def table(folder: Path, training: str, condition: str) -> str:
     ]
     for each in found:
         low, high = each.interval
-        drawn = f"{low:.1f} to {high:.1f}" if each.pairs > 1 else ""
-        start = f"| {each.rival} | {each.difference:.1f} | {drawn} | "
+        drawn = _interval(low, high) if each.pairs > 1 else ""
+        start = f"| {each.rival} | {_number(each.difference)} | {drawn} | "
         end = f" | {each.ahead} of {each.pairs} |"
         if each.test is None:
             lines.append(f"{start}| | |{end}")
             continue
         t, p = each.test.difference_t, each.test.paired_t.p
         lines.append(
-            f"{start}{t.low:.1f} to {t.high:.1f} | {p:.2g} | {next(corrected):.2g} | "
+            f"{start}{_interval(t.low, t.high)} | {p:.2g} | {next(corrected):.2g} | "
             f"{each.test.wilcoxon.p:.2g}{end}"
         )
     return "\n".join(lines)
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    assert low is not None
+    assert high is not None
+    return f"{_number(low)} to {_number(high)}"
+
+
+def _number(value: float) -> str:
+    """To one decimal, 0 without a sign."""
+    return f"{round(value, 1) + 0.0:.1f}"
