@@ -104,8 +104,8 @@ def tiles(spec: ScanSpec, trajectories: int, precision: str = "ieee") -> tuple[i
         trajectories: of all runs.
         precision: of products.
     """
-    if precision != "ieee" and spec.anchored:
-        return 16, 32, 16  # products in TF32 need more registers; wider tiles spill
+    if precision != "ieee":  # products need more registers, so that wider tiles spill
+        return 16, 32 if spec.anchored else 64, 16
     widest = max(spec.hidden_size, spec.anchors, *spec.field, 16)
     down = 16 if trajectories < 2048 else 32
     across = 1 << (widest - 1).bit_length()
