@@ -361,7 +361,7 @@ def test_times_that_are_not_finite_never_reach_the_module(time: float) -> None:
         return
     far = ob.Dataset((ob.Trajectory([0.0, 1.0, time], values),))
     model = ob.make_model("ode_rnn", far)
-    with pytest.raises(ob.InputError, match="decay_span is (inf|-?nan), expected a finite number"):
+    with pytest.raises(ob.InputError, match=r"decay_span is (inf|-?nan), expected a finite number"):
         ob.predict(model, far)
 
 
