@@ -65,7 +65,7 @@ sanitize: .venv/.test ## build the kernel with sanitizers, then run its tests
 	$(BIN)/cmake --build $(SANITIZED)
 	LD_PRELOAD="$(RUNTIME)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1 \
 		OMP_NUM_THREADS=1 OFFBEAT_TEST_CPU=$(CURDIR)/$(SANITIZED) \
-		$(BIN)/python -m pytest tests/test_kernel_limits.py \
+		$(BIN)/python -m pytest tests/test_kernel_limits.py tests/test_compiled_optimizer.py \
 		tests/test_kernels.py tests/test_cpu_engine.py tests/test_stream_in_order.py -n $(WORKERS) --timeout=1200 $(PYTEST_ARGS)
 
 .PHONY: clean
