@@ -136,3 +136,34 @@ def test_fields_of_an_array_of_numpy_are_channels(tmp_path):
     np.save(tmp_path / "log.npy", np.array([{}, 1], dtype=object))
     with pytest.raises(FileFormatError, match="holds pickled Python objects"):
         read(tmp_path / "log.npy")
+
+
+def test_structs_in_an_array_of_matlab_are_episodes(tmp_path):
+    runs = [{"t": TIMES, "x": X + i} for i in range(3)]
+    scipy_io.savemat(tmp_path / "log.mat", {"run": runs})
+    dataset = read(tmp_path / "log.mat")
+    assert dataset.meta["labels"] == ["0", "1", "2"]
+    assert [t.values[:, 0].tolist() for t in dataset] == [(X + i).tolist() for i in range(3)]
+
+
+def test_matlab_may_state_a_rate_or_times_as_text(tmp_path):
+    for name, value in (("Fs", 50.0), ("dt", 0.02)):
+        scipy_io.savemat(tmp_path / "log.mat", {"x": X, name: value})
+        dataset = read(tmp_path / "log.mat")
+        assert dataset[0].times == pytest.approx(TIMES, abs=1e-9)
+        assert f"row number / 50 Hz, as {name!r} says" in notes(dataset)
+    scipy_io.savemat(tmp_path / "log.mat", {"x": X, "version": 3.0, "dt": 1e12})
+    with pytest.raises(FileFormatError, match="has no array of times"):
+        read(tmp_path / "log.mat")
+    texts = np.array([f"2026-07-28 14:03:{i:02d}" for i in range(ROWS)])
+    scipy_io.savemat(tmp_path / "log.mat", {"time": texts, "x": X})
+    assert read(tmp_path / "log.mat")[0].times.tolist() == list(range(ROWS))
+
+
+def test_quaternions_of_groups_are_made_continuous(tmp_path):
+    turns = np.column_stack([0 * X, 0 * X, np.sin(X), np.cos(X)])
+    turns[20:] *= -1
+    path = groups.written(tmp_path / "log.h5", {"time": TIMES, "base_quat": turns})
+    (trajectory,) = dataset = read(path)
+    assert (np.abs(np.diff(trajectory.values, axis=0)) < 0.5).all()
+    assert dataset.meta["cleaning"]["quaternions"]

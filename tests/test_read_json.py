@@ -31,6 +31,10 @@ def lines(rows):
 JSON = {
     "lines": lines(PLAIN),
     "lines of texts": lines({"t": str(row["t"]), "x": str(row["x"])} for row in PLAIN),
+    "lines of MongoDB": lines(
+        {"t": {"$numberDouble": str(row["t"])}, "x": {"$numberDouble": str(row["x"])}}
+        for row in PLAIN
+    ),
     "lines with gaps between": lines(PLAIN).replace("\n", "\n\n"),
     "an array": json.dumps(PLAIN),
     "an array over lines": json.dumps(PLAIN, indent=2),
@@ -90,6 +94,10 @@ def test_messages_of_a_type_have_columns_of_their_own(tmp_path):
         (json.dumps([1, 2, 3]), "has '1' in row 0, expected an object"),
         (lines([{"a": {}}] * 3), "no channels|no column of times"),
         ("{}\n{}\n", "no column of times|no channels"),
+        (
+            lines({**row, "x": "err" if i == 3 else row["x"]} for i, row in enumerate(PLAIN)),
+            r"has 'err' in row 3, 'x', expected a number; leave the column out with without=",
+        ),
         (json.dumps(json.loads("[" * 30 + "]" * 30)), "in row 0, expected an object"),
     ],
 )

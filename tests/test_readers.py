@@ -50,7 +50,7 @@ class TestTheRegistry:
         assert read(csv_file("time,x\n0,1\n", "walk.log"), format="csv")[0].rows == 1
 
     def test_names_the_formats_it_knows(self, csv_file):
-        refused(csv_file("x", "walk.xyz"), r"'.xyz', expected one of: offbeat \(.parquet\), ")
+        refused(csv_file("x", "walk.xyz"), r"'.xyz', expected one of: .parquet .pq .csv ")
         refused(
             csv_file("x"),
             "unknown format 'excel', expected one of: .*csv",

@@ -12,7 +12,7 @@ from corpus.tables import NS, ROWS, TIMES, X, Y
 XY = np.column_stack([X, Y])
 
 
-def _written(path, arrays, attributes=None):
+def written(path, arrays, attributes=None):
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
             file[name] = values
@@ -87,12 +87,12 @@ HDF5 = {
 def of_kind(path, kind):
     """A file of a kind of `HDF5`."""
     arrays, units, _ = HDF5[kind]
-    return _written(path, arrays, units)
+    return written(path, arrays, units)
 
 
 def two_clocks(path, shift=0.0):
     """Two sensors with a clock of their own each, one 10 ms later."""
-    return _written(
+    return written(
         path,
         {
             "imu/time": TIMES, "imu/acc": XY,
@@ -103,7 +103,7 @@ def two_clocks(path, shift=0.0):
 
 def aloha(path):
     """An episode of ALOHA: no times, and pictures."""
-    return _written(
+    return written(
         path,
         {
             "action": 2 * XY,
@@ -118,7 +118,7 @@ def d4rl(path, ends=(9, 24)):
     """Episodes one after the other; the last one is not ended."""
     terminals, timeouts = np.zeros(ROWS, bool), np.zeros(ROWS, bool)
     terminals[ends[0]], timeouts[ends[1]] = True, True
-    return _written(
+    return written(
         path,
         {
             "observations": XY, "actions": 2 * XY[:, :1], "rewards": X, "next_observations": XY,
@@ -129,7 +129,7 @@ def d4rl(path, ends=(9, 24)):
 
 def episodes(path, names):
     """A group per episode, each with its times."""
-    return _written(
+    return written(
         path,
         {
             f"{name}/{part}": values + (i if part != "time" else 0)

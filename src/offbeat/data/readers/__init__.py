@@ -398,12 +398,10 @@ def reader_of(path: Path) -> Reader:
     if suffix in CONVERTED:
         raise FileFormatError(f"{path} is {CONVERTED[suffix]}")
     if not fitting:
-        named = (
-            f"{reader.name} ({', '.join(sorted(reader.suffixes))})" for reader in READERS.values()
-        )
+        known = {s: None for reader in READERS.values() for s in reader.suffixes if s != FOLDER}
         raise FileFormatError(
-            f"{path} has the unknown suffix {suffix!r}, expected one of: {', '.join(named)}; "
-            "rename it, or name its format with format="
+            f"{path} has the unknown suffix {suffix!r}, expected one of: {' '.join(known)}; rename "
+            "it, or name its format with format="
         )
     # No reader recognises it: one that needs only the suffix gives the best message.
     return next((reader for reader in fitting if reader.recognises is None), fitting[0])

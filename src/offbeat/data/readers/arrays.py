@@ -190,7 +190,11 @@ def _of_texts(
     texts = [pa.array([str(t) for t in arrays[n].astype(str).ravel().tolist()])
              for n in (stamp.time, stamp.rest) if n]  # fmt: skip
     first = texts[0][0].as_py() if len(texts[0]) else ""
-    form = form_in((text.strip() for text in texts[0].slice(0, _SAMPLE).to_pylist()), day_first)
+    form = form_in(
+        (text.strip() for text in texts[0].slice(0, _SAMPLE).to_pylist()),
+        day_first,
+        where=str(path),
+    )
     try:
         if form is None:
             raise pa.ArrowInvalid(f"{first[:60]!r} is no time")

@@ -316,7 +316,7 @@ def _form(path: Path, columns: Columns, sample: ArrowSample, day_first: bool | N
     """
     texts = sample.texts(columns.time)
     first = next((text for text in texts if text), "")
-    form = form_in(map(str.strip, texts), day_first)
+    form = form_in(map(str.strip, texts), day_first, where=str(path))
     if form is None:
         raise FileFormatError(
             f"{path} has {first[:60]!r} in column {columns.time!r}, expected times: numbers, time "

@@ -65,7 +65,7 @@ class CsvSample:
 
     def form_of(self, name: str) -> str | None:
         """The form of times as text, by the first one."""
-        return form_in(self.texts(name), self.file.day_first)
+        return form_in(self.texts(name), self.file.day_first, where=str(self.file.path))
 
 
 @dataclass(frozen=True)

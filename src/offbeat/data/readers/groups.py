@@ -20,6 +20,8 @@ from offbeat.data.recording import Recording
 from offbeat.data.signals import Signal
 from offbeat.errors import FileFormatError, NoLogError, listed, one_of
 
+_QUATERNIONS = ("_quat", "/quat", "_quaternion", "/quaternion", "orientation_xyzw")
+
 Leaves = Mapping[str, NDArray[Any]]
 """Arrays by path, such as `imu/acc`."""
 
@@ -220,7 +222,7 @@ def _noted(
     return [
         replace(
             one,
-            signals=tuple(map(_with_actions, one.signals)),
+            signals=tuple(map(_with_kinds, one.signals)),
             label="/".join(filter(None, (label, one.label))),
             origin=f"{path.name}, {label}" if label else one.origin,
             notes=(*one.notes, *notes),
@@ -230,8 +232,35 @@ def _noted(
     ]
 
 
-def _with_actions(signal: Signal) -> Signal:
-    """A signal whose channels of actions have that role."""
+_SLOWEST_HZ = 1e-3  # a smaller one is no rate: the number is something else
+RATES = ("rate_hz", "rate", "sample_rate", "sampling_rate", "sampling_frequency", "fs", "hz",
+         "fps", "frequency", "control_freq")  # fmt: skip
+STEPS = ("dt", "timestep", "time_step", "sample_time", "sampling_time", "ts")
+"""Names of numbers that say how many rows a second there are, or how many seconds a step takes."""
+
+
+def rate_of(numbers: Mapping[str, Any]) -> tuple[float | None, str]:
+    """The rate in single numbers by name, and a note on it; None if they say none."""
+    for name, value in numbers.items():
+        number = np.asarray(value)
+        if number.size != 1 or number.dtype.kind not in "iuf":
+            continue
+        found = float(number.reshape(()))
+        last = name.rpartition("/")[2].casefold()
+        rate = found if last in RATES else 1 / found if last in STEPS and found > 0 else 0.0
+        if _SLOWEST_HZ <= rate <= 1e9:
+            return rate, f"stamps are row number / {rate:g} Hz, as {name!r} says"
+    return None, ""
+
+
+def _with_kinds(signal: Signal) -> Signal:
+    """A signal whose channels of actions have that role, and those of quaternions that kind."""
+    bases = [name.rpartition("[")[0] for name in signal.channels]
+    kinds = tuple(
+        "quaternion" if bases.count(base) == 4 and base.endswith(_QUATERNIONS) else kind
+        for base, kind in zip(bases, signal.kinds, strict=True)
+    )
+    signal = replace(signal, kinds=kinds)
     first = [name.replace("[", "/").replace(".", "/").split("/")[0] for name in signal.channels]
     roles = tuple("action" if name in ("action", "actions") else "state" for name in first)
     return replace(signal, roles=roles)

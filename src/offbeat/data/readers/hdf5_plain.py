@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offbeat.data.cleaning.clocks import time_column_of
-from offbeat.data.readers.groups import recordings_of_groups
+from offbeat.data.readers.groups import rate_of, recordings_of_groups
 from offbeat.data.readers.hdf5_file import (
     check_storage,
     leaves_of,
@@ -48,9 +48,6 @@ _BESIDE = (*_ENDS, "rewards", "reward", "next_observations", "infos", "metadata"
 """Arrays of D4RL that are no states."""
 
 _LABEL = "episode"
-_RATES = ("rate_hz", "rate", "sample_rate", "sampling_rate", "sampling_frequency", "fs", "hz",
-          "fps", "frequency", "control_freq")  # fmt: skip
-_STEPS = ("dt", "timestep", "time_step", "sample_time", "sampling_time")
 
 
 def plain_recordings(
@@ -150,18 +147,11 @@ def _rate_in(*nodes: Any) -> tuple[float | None, str]:
         numbers = {
             name: value[()]
             for name, value in (node.items() if isinstance(node, h5py.Group) else ())
-            if isinstance(value, h5py.Dataset) and not value.ndim and value.dtype.kind in "iuf"
+            if isinstance(value, h5py.Dataset) and value.size == 1 and value.dtype.kind in "iuf"
         }
-        for name, value in {**numbers, **dict(node.attrs)}.items():
-            number = np.asarray(value)
-            if number.size != 1 or number.dtype.kind not in "iuf":
-                continue
-            found = float(number.reshape(()))
-            rate = found if name.casefold() in _RATES else 0.0
-            if name.casefold() in _STEPS and found > 0:
-                rate = 1 / found
-            if 0 < rate <= 1e9:
-                return rate, f"stamps are row number / {rate:g} Hz, as {name!r} says"
+        rate, note = rate_of({**numbers, **dict(node.attrs)})
+        if rate is not None:
+            return rate, note
     return None, ""
 
 

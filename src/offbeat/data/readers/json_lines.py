@@ -129,6 +129,9 @@ def recordings_of_rows(
     require_rows(path, len(rows), len(names))
     import pyarrow as pa
 
+    for name in names:
+        if name not in options.without:
+            _check_texts(path, name, [row.get(name) for row in rows])
     table = pa.table({name: _column([row.get(name) for row in rows]) for name in names})
     made = recordings_of(TableSource(path, what, table), options, time_unit)
     return [replace(one, notes=(*one.notes, *notes)) for one in made]
@@ -248,7 +251,9 @@ def _flat(row: Any, path: Path, i: int) -> Row:
     def put(name: str, value: Any, depth: int) -> None:
         if depth > _DEEPEST:
             raise FileFormatError(f"{path} nests objects more than {_DEEPEST} deep, in row {i}")
-        if isinstance(value, dict):
+        if isinstance(value, dict) and len(value) == 1 and (key := next(iter(value)))[:1] == "$":
+            put(name, value[key], depth + 1)  # a type of MongoDB, as {"$date": ...}
+        elif isinstance(value, dict):
             for key, inner in value.items():
                 put(f"{name}.{key}" if name else str(key), inner, depth + 1)
         elif isinstance(value, list):
@@ -285,6 +290,18 @@ def _by_type(rows: list[Row]) -> list[Row]:
 def _is_common(name: str) -> bool:
     """Whether a field of all messages is the time or the trajectory."""
     return time_column_of([name]) is not None or name.casefold() in LABEL_NAMES
+
+
+def _check_texts(path: Path, name: str, values: list[Any]) -> None:
+    """Raises an error for a text among numbers."""
+    texts = [i for i, v in enumerate(values) if isinstance(v, str) and v.strip() not in MISSING]
+    texts = [i for i in texts if number_in(values[i], ".") is None]
+    numbers = sum(isinstance(v, int | float) for v in values)
+    if texts and numbers > len(texts):
+        raise FileFormatError(
+            f"{path} has {values[texts[0]][:40]!r} in row {texts[0]}, {name!r}, expected a number; "
+            "leave the column out with without="
+        )
 
 
 def _column(values: list[Any]) -> Any:

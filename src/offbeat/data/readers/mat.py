@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offbeat.data.cleaning.clocks import time_column_of
 from offbeat.data.memory import require_memory
 from offbeat.data.readers import hdf5
-from offbeat.data.readers.groups import recordings_of_groups
+from offbeat.data.readers.groups import rate_of, recordings_of_groups
 from offbeat.data.readers.table_options import TableOptions
 from offbeat.data.recording import Recording
 from offbeat.data.source import require_file
@@ -55,19 +57,51 @@ def read_mat(
     path = require_file(path)
     options = TableOptions(time_column=time_column, rate_hz=rate_hz)
     values, left = _load(path)
+    episodes = [v for v in values.values() if isinstance(v, list | np.ndarray) and _are_structs(v)]
+    if len(episodes) == 1:
+        return [
+            one
+            for i, part in enumerate(episodes[0])
+            for one in _recordings(path, part, list(left), options, time_unit, str(i))
+        ]
+    return _recordings(path, values, left, options, time_unit)
+
+
+def _are_structs(values: Any) -> bool:
+    return len(values) > 0 and all(isinstance(value, dict) for value in values)
+
+
+def _recordings(
+    path: Path,
+    values: dict[str, Any],
+    left: list[str],
+    options: TableOptions,
+    time_unit: str | None,
+    label: str = "",
+) -> list[Recording]:
+    """The recordings of the variables of a file, or of a struct that is an episode."""
     leaves: dict[str, NDArray[Any]] = {}
+    numbers: dict[str, Any] = {}
     for name, array in _leaves(values):
         fits = isinstance(array, np.ndarray) and array.dtype.kind in "biuf" and 0 < array.ndim <= 2
+        fits = fits or (isinstance(array, np.ndarray) and array.dtype.kind in "SU")
         if fits and (array.ndim < 2 or min(array.shape) <= _WIDEST):
             leaves[name] = array
         else:
+            numbers[name] = array
             left.append(name)
     if not leaves:
         raise FileFormatError(
             f"{path} holds no array of numbers; it has: {listed(left) or 'nothing'}; objects such "
             "as timeseries and table must be saved as arrays: t = x.Time; y = x.Data"
         )
-    return recordings_of_groups(path, leaves, options, time_unit, left=left)
+    last = [name.rpartition("/")[2] for name in leaves]
+    if options.rate_hz is None and options.time_column is None and time_column_of(last) is None:
+        rate, note = rate_of({k: v for k, v in numbers.items() if isinstance(v, int | float)})
+        options = replace(options, rate_hz=rate)
+        made = recordings_of_groups(path, leaves, options, time_unit, left=left, label=label)
+        return [replace(one, notes=(note, *one.notes[1:])) if note else one for one in made]
+    return recordings_of_groups(path, leaves, options, time_unit, left=left, label=label)
 
 
 def _load(path: Path) -> tuple[dict[str, Any], list[str]]:

@@ -91,13 +91,14 @@ def form_of(field: str) -> str | None:
     return "with" if offset else "without"
 
 
-def form_in(texts: Iterable[str], day_first: bool | None = None) -> str | None:
+def form_in(texts: Iterable[str], day_first: bool | None = None, *, where: str = "") -> str | None:
     """The form of the times of a column, by its first texts; empty ones are not known.
 
     Args:
         texts: the first ones.
         day_first: of dates such as 07/08/2026, whether the day is before the month; by default the
             texts decide, by a number above 12.
+        where: the file, for messages.
 
     Raises:
         InputError: no text decides.
@@ -114,8 +115,8 @@ def form_in(texts: Iterable[str], day_first: bool | None = None) -> str | None:
     )
     if found is None:
         raise InputError(
-            f"dates such as {first[:40]!r} may begin with the day or the month; say which with "
-            "day_first=true or day_first=false"
+            f"{where}{': ' * bool(where)}dates such as {first[:40]!r} may begin with the day or "
+            "the month; say which with day_first=true or day_first=false"
         )
     return found
 
