@@ -398,9 +398,9 @@ def reader_of(path: Path) -> Reader:
     if suffix in CONVERTED:
         raise FileFormatError(f"{path} is {CONVERTED[suffix]}")
     if not fitting:
-        known = {s: None for reader in READERS.values() for s in reader.suffixes if s != FOLDER}
+        taken = {s: None for reader in READERS.values() for s in reader.suffixes if s != FOLDER}
         raise FileFormatError(
-            f"{path} has the unknown suffix {suffix!r}, expected one of: {' '.join(known)}; rename "
+            f"{path} has the unknown suffix {suffix!r}, expected one of: {' '.join(taken)}; rename "
             "it, or name its format with format="
         )
     # No reader recognises it: one that needs only the suffix gives the best message.
