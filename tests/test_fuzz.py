@@ -24,7 +24,9 @@ def test_an_unchanged_file_is_read(name, tmp_path, monkeypatch):
     assert [said for _, said in fuzz.outcomes(name, range(3), good)] == ["read"] * 3
 
 
-@pytest.mark.parametrize(("name", "number"), [("lerobot v3.0", 402), ("lerobot v3.0", 1035)])
+@pytest.mark.parametrize(
+    ("name", "number"), [("lerobot v3.0", 402), ("lerobot v3.0", 1035), ("ros_echo", 51000153)]
+)
 def test_mutants_that_once_ended_in_a_fault(name, number, tmp_path):
     assert fuzz.outcome(name, number, fuzz.prepared(name, tmp_path / "good")) == "refused"
 

@@ -130,8 +130,8 @@ def _clocks(path: Path, leaves: Leaves, given: Any) -> dict[str, tuple[int, tupl
         one_of("time_column", str(given), list(leaves))
     if not found:
         raise NoLogError(
-            f"{path} has no array of times: one must be called time, t, timestamp, ... got "
-            f"{listed(list(leaves), 12, quoted=True)}; say which one with time_column=, or give "
+            f"{path} has no array of times (called time, t, timestamp, ...), got "
+            f"{listed(list(leaves), 12, quoted=True)}; name one with time_column=, or give "
             "rate_hz="
         )
     return found

@@ -130,8 +130,8 @@ def stamp_columns(
             "with time_column="
         )
     raise NoLogError(
-        f"{path} has no {what} of times: one must be called {', '.join(TIME_NAMES[:3])}, ... got "
-        f"{listed(names, 12, quoted=True)}; say which one with time_column=, or give rate_hz="
+        f"{path} has no {what} of times (called {', '.join(TIME_NAMES[:3])}, ...), got "
+        f"{listed(names, 12, quoted=True)}; name one with time_column=, or give rate_hz="
     )
 
 
