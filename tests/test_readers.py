@@ -187,7 +187,7 @@ class TestCsv:
         ("text", "message"),
         [
             ("\n\n", "must name its columns in line 1, got empty lines alone"),
-            ("hip,knee\n0,1\n", "no column of times.*got 'hip', 'knee'; say which"),
+            ("hip,knee\n0,1\n", "no column of times.*got 'hip', 'knee'; name one"),
             ("time\n0\n", "no channels, only the columns 'time'"),
             ("time,x,x\n0,1,2\n", "the column name 'x' twice"),
             ("time,,x\n0,1,2\n", "no name for column 1"),
