@@ -5,6 +5,9 @@ baselines is fitted to its training and validation parts, and its test part is a
 fills of silences from the past and from both sides, and forecasts. A loss is an error that is more
 than 5 % above that of the best simple baseline, which is chosen in hindsight.
 
+With `--short`, the same for the short logs of `short_logs`, each scored on the minute and a half
+that follows it, and without fills from both sides.
+
 Whether a loss is one of the method or of chance is decided by blocks of the test part as long as
 the time asked for: with fewer than `FEWEST` of them nothing is said, and with more, the squared
 errors of the blend must be larger by two standard errors of their mean over blocks.
@@ -19,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from odd_logs import ODD_LOGS
+from short_logs import SHORT_LOGS
 
 import offbeat as ob
 from offbeat.answers.blend import TASKS, Blend, fit_blend
@@ -37,6 +41,9 @@ LOSS = 1.05
 
 FEWEST = 20
 """Blocks of the test part below which a comparison says nothing."""
+
+TARGETS = 17
+"""Forecasts of each horizon in each of the pieces that follow a short log."""
 
 EXACT = 1e-3
 """Errors below this part of a channel's spread are no losses."""
@@ -101,19 +108,37 @@ def compared(name: str, *, count: int = TASKS) -> list[Compared]:
         name: of `ODD_LOGS`.
         count: tasks that it is fitted to, at most.
     """
-    dataset = ODD_LOGS[name]()
+    return compared_on(name, ODD_LOGS[name](), None, count=count)
+
+
+def compared_on(
+    name: str, dataset: ob.Dataset, test: ob.Dataset | None, *, count: int = TASKS
+) -> list[Compared]:
+    """The same of any log.
+
+    Args:
+        name: of the log.
+        dataset: it.
+        test: to score, without fills from both sides; by default the test part of the log.
+        count: as of `compared`.
+    """
     chosen = plan(dataset)
-    train, validation, test = ob.apply_split(prepare(dataset, chosen), chosen.whole)
-    blend = fit_blend(train, validation, tasks=chosen.tasks, count=count)
-    test = blend.transforms.apply(test)
+    train, validation, rest = ob.apply_split(prepare(dataset, chosen), chosen.whole)
+    both = None if test is None else ("linear",)
+    blend = fit_blend(train, validation, tasks=chosen.tasks, two_sided=both, count=count)
+    test = blend.transforms.apply(rest if test is None else test.select(blend.names))
     found: list[Compared] = []
-    for asked in _asked(test, chosen.tasks, chosen.horizons_s):
-        found += _compared(name, blend, asked)
+    targets = 100 if both is None else TARGETS
+    for asked in _asked(test, chosen.tasks, chosen.horizons_s, targets):
+        if both is None or not asked.both:
+            found += _compared(name, blend, asked)
     return found
 
 
-def _asked(test: ob.Dataset, config: TaskConfig, horizons: Sequence[float]) -> Iterator[Asked]:
-    """One step, fills of silences, and forecasts."""
+def _asked(
+    test: ob.Dataset, config: TaskConfig, horizons: Sequence[float], targets: int = 100
+) -> Iterator[Asked]:
+    """One step, fills of silences, and forecasts, so many of each trajectory."""
     seen = []
     for t in test:
         before = np.zeros_like(t.observed)
@@ -133,7 +158,7 @@ def _asked(test: ob.Dataset, config: TaskConfig, horizons: Sequence[float]) -> I
         cut: list[ob.Trajectory] = []
         pieces, scored = [], []
         for piece in range(len(test)):
-            tasks, counted = forecast_tasks(test[piece : piece + 1], horizon, 100)
+            tasks, counted = forecast_tasks(test[piece : piece + 1], horizon, targets)
             cut += tasks or ()
             pieces += [piece] * len(counted)
             scored += counted
@@ -204,11 +229,17 @@ def table(found: Sequence[Compared]) -> str:
 def main() -> None:
     """Prints the table, and each loss that is not by chance."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--log", action="append", choices=ODD_LOGS, help="by default all")
-    names = parser.parse_args().log or ODD_LOGS
+    parser.add_argument("--log", action="append", choices=[*ODD_LOGS, *SHORT_LOGS])
+    parser.add_argument("--short", action="store_true", help="the short logs")
+    parser.add_argument("--seeds", type=int, default=1, help="of the short logs")
+    given = parser.parse_args()
     found: list[Compared] = []
-    for name in names:
-        found += compared(name)
+    for name in given.log or (SHORT_LOGS if given.short else ODD_LOGS):
+        if name in SHORT_LOGS:
+            for seed in range(given.seeds):
+                found += compared_on(name, *SHORT_LOGS[name](seed))
+        else:
+            found += compared(name)
         print(table([each for each in found if each.log == name]).splitlines()[-1], flush=True)
     print("\n" + table(found) + "\n")
     for each in found:

@@ -231,3 +231,9 @@ def test_a_blend_says_which_channels_are_filtered_together():
     names = {"causal": ("last_value", "motion_filter"), "two_sided": ("linear",)}
     notes = ob.fit_blend(data, data, count=30, **names).notes()
     assert any(note.startswith("filtered together: x <- vx") for note in notes)
+
+
+def test_a_log_whose_only_group_has_an_acceleration_is_filtered():
+    data = outages(robot(0, count=8), 0, cut=False).select(NAMES[:3])
+    motion = MotionSmoother().fit(data)
+    assert [group.channels for group in motion.groups] == [(0, 1, 2)]

@@ -37,7 +37,8 @@ class MotionBaseline(ChainBaseline):
         """See `Baseline`."""
         single, alone = singles(self, tasks, "all")
         found = find_groups(tasks)
-        tried = {n: self._chains(tasks, found, n) for n in (2, 3)} if found else {}
+        orders = [n for n in (2, 3) if any(len(group.channels) <= n for group in found)]
+        tried = {n: self._chains(tasks, found, n) for n in orders}
         parts: dict[int, list[tuple[Chains, int]]] = {2: [], 3: []}
         used: list[Group] = []
         for group in found:
