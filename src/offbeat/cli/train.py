@@ -117,6 +117,10 @@ def train_command(
             dataset, chosen = read_planned(
                 data, reader, horizon_s=horizon_s, split=given_split, seed=split.seed
             )
+    if chosen is not None:
+        reader, split = dict(chosen.reader), chosen.split
+        for note in chosen.notes:
+            print(f"offbeat: {note}", file=sys.stderr)
     as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
     open_model = model == ModelConfig()
     with group(device) as ranks, locked(out) if is_first() else nullcontext():
