@@ -91,6 +91,7 @@ def test_results_show_a_few_lines_however_long_they_are(learned):
         lambda: ob.forecast("runs/arm", LOG, 0.1),
         lambda: ob.evaluate("runs/arm", LOG),
         lambda: ob.evaluate({"mine": 3}, LOG),
+        lambda: ob.evaluate({"blend": ob.fit_blend(LOG, LOG, causal=("mean",))}, LOG),
         lambda: ob.evaluate(ob.make_model("gru", LOG), LOG, horizons=[0.1]),
         lambda: ob.Stream(None),
         lambda: ob.export_onnx("runs/arm", "arm.onnx"),

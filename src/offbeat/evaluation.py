@@ -204,6 +204,9 @@ def evaluate(
         device: that the models are computed on, as of `fit`, and moved back from; by default their
             own.
 
+    Returns:
+        Scores in scaled units and in the units of the channels.
+
     Raises:
         InputError: the data has other channels than a model, models score in other units, or
             horizons are given for a model; `score_forecast` scores its forecasts.
@@ -223,8 +226,12 @@ def evaluate(
         models = {models.name: models}
     if not models or LAST_VALUE in models:
         raise InputError(f"give at least one model, none of them named {LAST_VALUE!r}")
-    for model in models.values():
-        answering(model)
+    for name, model in models.items():
+        if not isinstance(model, BaseModel):
+            raise InputError(
+                f"expected a trained model as {name!r}, got {type(model).__name__}; a blend is "
+                "evaluated alone, as evaluate(blend, dataset)"
+            )
     first = next(iter(models.values()))
     for name, model in models.items():
         same = (
@@ -271,6 +278,9 @@ def evaluate_blend(
         horizons: s; by default parts of the longest one that the blend was fitted for, as long as
             the data, where it predicts at any time.
         seed: of the tasks, and of self-feeding.
+
+    Returns:
+        Scores in scaled units and in the units of the channels.
 
     Raises:
         InputError: the data has other channels than the blend, or horizons do not fit.

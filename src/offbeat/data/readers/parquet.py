@@ -171,31 +171,27 @@ def read_feather(
 ) -> list[Recording]:
     """Reads recordings from Feather, a file of Arrow, or a stream of Arrow.
 
-    Columns have the same meaning as in Parquet, and options that of `read_parquet`.
+    Columns have the same meaning as in Parquet.
 
     Args:
         path: the file.
-        time_column: the column of times, or two that hold the stamp together; by default found by
-            its name, see `TIME_NAMES`, or the index of pandas where it holds time stamps.
-        trajectory_column: the column with the trajectory of each row; by default found
-            by its name, see `LABEL_NAMES`.
-        channels: the columns to read as channels, in this order; by default all numbers.
-        without: columns to leave out.
-        time_unit: `s`, `ms`, `us`, `100ns`, `ns`, `min`, `h` or `d`; by default from the column's
-            type or name, else detected from the numbers, which is noted, else `s`.
-        units: unit of a channel by its name.
-        channel_column: the column with the channel of each value, in the long form.
-        value_column: the column of values, in the long form.
-        instance_column: the column with the sensor of each row, as in CSV.
-        rate_hz: rows per second, for a file without times.
-        day_first: of dates such as 07/08/2026, whether the day is before the month; by default
-            decided by a number above 12 in the first rows, else asked for.
+        time_column: as of `read_parquet`.
+        trajectory_column: as of `read_parquet`.
+        channels: as of `read_parquet`.
+        without: as of `read_parquet`.
+        time_unit: as of `read_parquet`.
+        units: as of `read_parquet`.
+        channel_column: as of `read_parquet`.
+        value_column: as of `read_parquet`.
+        instance_column: as of `read_parquet`.
+        rate_hz: as of `read_parquet`.
+        day_first: as of `read_parquet`.
 
     Returns:
         A recording per trajectory, in the order of their first rows; null is NaN.
 
     Raises:
-        FileFormatError: the file is missing, empty, truncated, not Parquet, has no time, or no
+        FileFormatError: the file is missing, empty, truncated, not Arrow, has no time, or no
             channel that is numeric.
         InputError: an option names an unknown column or unit.
     """

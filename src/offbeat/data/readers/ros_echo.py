@@ -49,6 +49,9 @@ def read_ros_echo(
         units: as of `read_csv`.
         rate_hz: as of `read_csv`, for messages without a stamp.
 
+    Returns:
+        One recording, a row per message.
+
     Raises:
         FileFormatError: a message is no YAML, has aliases, is longer than 200,000 characters or
             nested too deeply; there is no time, or no channel of numbers.
