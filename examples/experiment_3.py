@@ -15,7 +15,6 @@ what is there is not run again. It needs `offbeat[sim]`.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from itertools import product
 from pathlib import Path
@@ -25,6 +24,7 @@ import numpy as np
 import torch
 
 import offbeat as ob
+from examples import experiment_3_report
 from examples.real_logs.results import machine
 from offbeat.baselines import fit_baseline
 from offbeat.files import write_json
@@ -86,34 +86,6 @@ def run(name: str, data: tuple[ob.Dataset, ...], epochs: int, repeat: int) -> di
     }
 
 
-def table(folder: Path) -> str:
-    """A Markdown table: mean RMSE of the repeats, and processor time of a training."""
-    records = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
-    columns = [
-        (robot, rows, fraction)
-        for robot, rows, fraction in product(ROBOTS, (100, 1000), FRACTIONS)
-        if any((r["robot"], r["rows"], r["fraction"]) == (robot, rows, fraction) for r in records)
-    ]
-    heads = [f"{robot}, {rows} rows, {100 * fraction:.0f} %" for robot, rows, fraction in columns]
-    lines = [
-        "| predictor | " + " | ".join(heads) + " | s | repeats |",
-        "|---" * (len(heads) + 3) + "|",
-    ]
-    for name in (*BASELINES, *MODELS):
-        own = [r for r in records if r["predictor"] == name]
-        if not own:
-            continue
-        entries, repeats = [], set()
-        for column in columns:
-            some = [r for r in own if (r["robot"], r["rows"], r["fraction"]) == column]
-            repeats.add(len(some))
-            entries.append(f"{np.mean([r['rmse'] for r in some]):.4f}" if some else "not run")
-        seconds = f"{np.mean([r['seconds'] for r in own]):.0f}"
-        count = f"{min(repeats)}" if len(repeats) == 1 else f"{min(repeats)} to {max(repeats)}"
-        lines.append(f"| {name} | {' | '.join(entries)} | {seconds} | {count} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -124,15 +96,10 @@ def main() -> None:
     add("--epochs", type=int, default=50)
     add("--repeats", type=int, default=5)
     add("--minutes", type=float, help="stop after the training that is in progress then")
-    add("--document", type=Path, help="write the table into this document instead")
+    add("--document", type=Path, help="write the tables into this document instead")
     asked = parser.parse_args()
     if asked.document is not None:
-        text = asked.document.read_text(encoding="utf-8")
-        marks = ("<!-- experiment 3 -->", "<!-- end of experiment 3 -->")
-        before, rest = text.split(marks[0])
-        after = rest.split(marks[1])[1]
-        inside = f"{marks[0]}\n\n{table(RESULTS)}\n\n{marks[1]}"
-        asked.document.write_text(before + inside + after, encoding="utf-8")
+        experiment_3_report.write(asked.document, RESULTS)
         return
     torch.set_num_threads(1)
     stop = time.monotonic() + 60 * (asked.minutes or 1e9)

@@ -28,6 +28,7 @@ from examples.linear_state_space import LRUNetwork
 from examples.policies.robots import HERE, linear
 from examples.real_logs.results import machine
 from offbeat.baselines import fit_baseline
+from offbeat.comparison.statistics import holm, welch_t
 from offbeat.data.trajectory import STATE
 from offbeat.files import write_json
 from offbeat.policies import demonstrate
@@ -110,6 +111,7 @@ MODELS: dict[str, tuple[str, dict[str, Any]]] = {
     "ODE-RNN": ("ode_rnn", {}),
     "ODE-GRU-D": ("ode_gru_d", {}),
     "anchored": ("anchored_ode_gru_d", {}),
+    "anchored, LSTM": ("anchored_ode_gru_d", {"cell": "lstm"}),
     "CfC": ("foreign", {"kind": "cfc"}),
     "CfC-mmRNN": ("foreign", {"kind": "cfc_mixed"}),
     "CfC, change of the last frame": ("foreign", {"kind": "cfc", "change": True}),
@@ -118,6 +120,7 @@ MODELS: dict[str, tuple[str, dict[str, Any]]] = {
     "LRU, two layers": ("foreign", {"kind": "lru"}),
 }
 BASELINES = {"last value": "last_value", "ridge": "ridge"}
+REFERENCE, FEWEST = "anchored", 3  # seeds that a test needs
 
 
 def made(rollouts: int, stride: int) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset]:
@@ -212,26 +215,40 @@ def run(name: str, seed: int, data: tuple[ob.Dataset, ...], epochs: int) -> dict
 
 
 def table(folder: Path) -> str:
-    """A Markdown table of the results."""
+    """A Markdown table: means over the seeds, and Welch's tests against the anchored model."""
     records = [json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")]
-    held = next(r["mse"] for r in records if r["model"] == "last value")
+    found = {
+        name: some
+        for name in (*BASELINES, *MODELS)
+        if (some := [r for r in records if r["model"] == name])
+    }
+    errors = {name: np.array([r["mse"] for r in some]) for name, some in found.items()}
+    order = sorted(found, key=lambda name: float(errors[name].mean()))
+    held, own = errors["last value"].mean(), errors[REFERENCE]
+    p_values = {
+        name: welch_t(own, errors[name]).p
+        for name in order
+        if name != REFERENCE and min(len(own), len(errors[name])) >= FEWEST
+    }
+    corrected = dict(zip(p_values, holm(list(p_values.values())) if p_values else (), strict=True))
     lines = [
-        "| model | MSE | of the last value | parameters | epochs | s per epoch | seeds |",
-        "|---" * 7 + "|",
+        "| model | MSE | of the last value | parameters | epochs | s per epoch | seeds "
+        f"| p, from {REFERENCE} |",
+        "|---" * 8 + "|",
     ]
-    rows = []
-    for name in (*BASELINES, *MODELS):
-        some = [r for r in records if r["model"] == name]
-        if not some:
-            continue
-        mse = float(np.mean([r["mse"] for r in some]))
-        first = some[0]
-        cost = np.mean([r.get("seconds_per_epoch", np.nan) for r in some])
+    for name in order:
+        mse, some = errors[name], found[name]
+        spread = f" ± {mse.std(ddof=1):.3f}" if len(mse) > 1 else ""
         end = " | | "
-        if "epochs" in first:
-            end = f"{first['parameters']:,} | {first['epochs']} | {cost:.1f}"
-        rows.append((mse, f"| {name} | {mse:.3f} | {mse / held:.3f} | {end} | {len(some)} |"))
-    return "\n".join([*lines, *(line for _, line in sorted(rows))])
+        if "epochs" in some[0]:
+            cost = np.mean([r["seconds_per_epoch"] for r in some])
+            end = f"{some[0]['parameters']:,} | {some[0]['epochs']} | {cost:.1f}"
+        p = f"{corrected[name]:.2g}" if name in corrected else ""
+        lines.append(
+            f"| {name} | {mse.mean():.3f}{spread} | {mse.mean() / held:.3f} | {end} | {len(some)} "
+            f"| {p} |"
+        )
+    return "\n".join(lines)
 
 
 def main() -> None:
