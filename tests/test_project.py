@@ -2,6 +2,8 @@
 
 import ast
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -27,9 +29,36 @@ def test_the_version_stands_in_one_place_and_the_papers_repeat_it():
     assert version["input"] == "src/offbeat/__init__.py"
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == offbeat.__version__
+    assert str(citation["date-released"]) in changelog_heading()
     assert citation["license"] == PROJECT["project"]["license"]
+    assert re.match(r"## \[(.+?)\]", changelog_heading())[1] == offbeat.__version__
+
+
+def changelog_heading():
+    """The heading of the newest version in the changelog."""
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert re.findall(r"^## \[(.+?)\]", changelog, re.MULTILINE)[0] == offbeat.__version__
+    return re.findall(r"^## .+$", changelog, re.MULTILINE)[0]
+
+
+def test_the_address_is_set_in_all_files_by_the_commands_of_the_release_guide(tmp_path):
+    files = ("pyproject.toml", "CITATION.cff", "mkdocs.yml")
+    guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^sed -i .+$", guide, re.MULTILINE)
+    assert len(commands) == 2
+    for name in files:
+        (tmp_path / name).write_bytes((ROOT / name).read_bytes())
+    if shutil.which("sed") and "ADDRESS" in (ROOT / "CITATION.cff").read_text(encoding="utf-8"):
+        for command in commands:
+            subprocess.run(["bash", "-c", command], cwd=tmp_path, check=True)
+    project = tomllib.loads((tmp_path / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    citation = yaml.safe_load((tmp_path / "CITATION.cff").read_text(encoding="utf-8"))
+    site = (tmp_path / "mkdocs.yml").read_text(encoding="utf-8")
+    address = project["urls"]["Repository"]
+    assert address.startswith("https://")
+    assert citation["repository-code"] == address
+    assert re.findall(r'^repo_url: "(.+)"$', site, re.MULTILINE) == [address]
+    assert citation["doi"].startswith("10.")
+    assert project["name"] == "offbeat"  # what follows the address is still read
 
 
 @pytest.mark.parametrize("text", [text for text in DECLARED if not text.startswith("offbeat[")])

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from offbeat.sweeps.sweep import sweep
     from offbeat.training import FitResult, fit
 
-__version__ = "0.2.0"
+__version__ = "1.0.0rc1"
 
 _PUBLIC = {
     "Answer": "answers.answer",
