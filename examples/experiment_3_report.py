@@ -149,6 +149,8 @@ def draw(found: Found, path: Path) -> None:
                 axis.plot(np.arange(1, len(mean) + 1), mean, color=f"C{i}", label=name)
         axis.set_title(setting.name, fontsize=9)
         axis.set_yscale("log")
+        for each_axis in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+            each_axis("{x:g}")
         axis.grid(alpha=0.3, which="both")
     for axis in axes[-1]:
         axis.set_xlabel("epoch")

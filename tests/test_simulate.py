@@ -327,18 +327,23 @@ def test_a_policy_drives_a_robot_and_begins_anew_for_every_trajectory():
     assert dataset.meta["control"] == "policy"
 
 
-def test_robots_of_gymnasium_start_as_their_environments_do():
+@pytest.mark.parametrize("name", ["Hopper", "Walker2d", "HalfCheetah", "Humanoid", "Ant"])
+def test_robots_of_gymnasium_start_and_fall_as_their_environments_do(name):
     gymnasium = pytest.importorskip("gymnasium")
-    dataset = quiet("Hopper-v5", 3, 9, seed=4)
-    env = gymnasium.make("Hopper-v5").unwrapped
+    dataset = quiet(f"{name}-v5", 3, 9, seed=4)
+    env = gymnasium.make(f"{name}-v5").unwrapped
     random = np.random.RandomState(4)
     for trajectory in dataset:
         env.reset(seed=int(random.randint(2**31)))
         start = np.concatenate([env.data.qpos, env.data.qvel])
         assert np.array_equal(trajectory.values[0], start)
-        env.step(np.zeros(3))  # four physics steps
+        env.step(np.zeros(env.model.nu))
         then = np.concatenate([env.data.qpos, env.data.qvel])
-        assert np.allclose(trajectory.values[4], then, atol=1e-12)
+        assert np.allclose(trajectory.values[env.frame_skip], then, atol=1e-12)
+
+
+def test_what_is_no_robot_of_gymnasium_is_said():
+    pytest.importorskip("gymnasium")
     with pytest.raises(InputError, match="no robot of MuJoCo"):
         quiet("CartPole-v1", 1)
     with pytest.raises(InputError, match="Gymnasium has no environment 'Hoper-v5'"):
