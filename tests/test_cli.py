@@ -2,6 +2,7 @@
 
 import csv
 import importlib.metadata
+import inspect
 import io
 import json
 import re
@@ -10,9 +11,10 @@ import subprocess
 import sys
 import time
 import tomllib
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NotRequired
 
 import numpy as np
 import pytest
@@ -23,9 +25,11 @@ from packaging.requirements import Requirement
 import offbeat as ob
 from offbeat import doctor, progress
 from offbeat.cli.app import COMMANDS, FREQUENT, main, run_commands
+from offbeat.cli.help import in_words
 from offbeat.cli.option_groups import reader_options, training_options
 from offbeat.cli.parser import CommandParser
 from offbeat.cli.train import train_command
+from offbeat.config import TaskConfig
 from offbeat.models.zoo import MODELS
 
 SMALL = [
@@ -78,7 +82,25 @@ def test_each_command_describes_every_option(command, capsys):
     text = capsys.readouterr().out
     options = [line for line in text.splitlines() if line.startswith("  --")]
     assert options
-    assert "None, default" not in text
+    main_line = inspect.cleandoc(COMMANDS[command].__doc__).splitlines()[0]
+    assert main_line in " ".join(text.split())
+    for python in ("<class", "None", "Union[", "Optional[", "list[", "Literal["):
+        assert python not in text, python
+    assert not re.search(r"--\w+[+]|default: null", text)
+
+
+def test_types_in_a_help_are_words():
+    known = {
+        Path | None: "path",
+        list[float] | float | None: "list of number or number",
+        float | Literal["auto"] | None: "number or one of auto",
+        Literal["a", "b"]: "one of a, b",
+        NotRequired[tuple[int, ...]]: "list of integer",
+        Mapping[str, str]: "JSON",
+        dict[str, int]: "JSON",
+        TaskConfig | None: "YAML",
+    }
+    assert {kind: in_words(kind) for kind in known} == known
 
 
 def test_python_m_offbeat_is_the_command():

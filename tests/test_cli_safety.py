@@ -151,7 +151,7 @@ def test_bash_completes_commands_options_and_choices(tmp_path):
         ["bash", "-c", COMPLETE], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert found.stdout.splitlines() == [
-        "export extrapolate",
+        "extrapolate export",
         "--split.observed_fraction",
         "--two_sided",
         "rows values bursts dropout",

@@ -207,6 +207,23 @@ class TestTimesOfIso8601:
         assert second.times.tolist() == [0.0, 0.25]
         assert dataset.meta["clock_start"] == [START * 10**9, (START + 1) * 10**9]
 
+    def test_of_the_long_form_may_have_a_column_of_units(self, text_file, tmp_path):
+        import pyarrow.csv
+        import pyarrow.parquet
+
+        rows = "0.01,hip,1,rad\n0.02,knee,90,deg\n0.03,hip,2,rad\n0.04,t,20,\n"
+        path = text_file(f"time,channel,value,Unit\n{rows}")
+        pyarrow.parquet.write_table(pyarrow.csv.read_csv(path), tmp_path / "long.parquet")
+        for file in (path, tmp_path / "long.parquet"):
+            (one,) = dataset = read(file)
+            assert (one.names, one.units) == (("hip", "knee", "t"), ("rad", "deg", ""))
+            assert same(one.values[:, 0], [1, NAN, 2, NAN])
+            assert dataset.meta["cleaning"]["notes"] == []
+        assert read(path, units={"knee": "rad"})[0].units == ("rad", "rad", "")
+        mixed = read(text_file(f"time,channel,value,unit\n{rows}0.05,hip,3,deg\n"))
+        assert mixed[0].units == ("", "deg", "")
+        assert "'hip' has several units in column 'unit' (deg, rad)" in str(mixed.meta["cleaning"])
+
     @pytest.mark.parametrize(
         ("first", "second", "message"),
         [

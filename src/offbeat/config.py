@@ -13,23 +13,24 @@ Activation = Literal["tanh", "silu"]
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Parts and options of a model. A field that is None takes the value of the zoo's entry.
+    """Parts and options of a model. A field that is None takes the value of the named model.
 
     Attributes:
-        name: id of the zoo's entry: `rnn`, `lstm`, `gru`, `rnn_decay`, `gru_d`, `neural_ode`,
+        name: name of the model: `rnn`, `lstm`, `gru`, `rnn_decay`, `gru_d`, `neural_ode`,
             `ode_rnn`, `ode_gru_d`, `anchored_ode_gru_d`, `anchored_trend`,
-            `anchored_trend_large`.
+            `anchored_trend_large`, or a registered one. Where no option of the model is given,
+            `offbeat train` tries a few on a log.
         hidden_size: units of the hidden state h.
         head: the map from a state to a prediction, and its loss: `point`, the expected value and
             the mean squared error; `gaussian`, a mean and a standard deviation and the negative
             log-likelihood; or a registered head.
         decoder_units: hidden layers of the head's decoder.
-        cell: update at an observation. `gru` is equations 20-23, `elman` 6, `lstm` 14-19; `none`
-            for a vector field without a cell; or a registered cell.
+        cell: update at an observation. `gru` is equations 20-23 of the thesis, `elman` 6, `lstm`
+            14-19; `none` for a vector field without a cell; or a registered cell.
         reset_after: GRU whose reset gate acts after the recurrent product, as in `torch.nn.GRU`,
             instead of before it, as in equation 22.
-        vector_field: `mlp`, a neural ODE between observations (equation 36), `none`, or a vector
-            registered field.
+        vector_field: `mlp`, a neural ODE between observations (equation 36), `none`, or a
+            registered vector field.
         field_units: hidden layers of the vector field.
         activation: nonlinearity of the vector field.
         solver: how the vector field is integrated over a gap: `euler`, `midpoint`, `heun`, `rk4`,

@@ -61,22 +61,22 @@ To see it at work in two minutes: offbeat demo"""
 # The functions are not named after the commands: jsonargparse would find their namesakes in the
 # lazy package `offbeat`, and import torch to look at them.
 COMMANDS: dict[str, Any] = {
-    "simulate": simulate_command,
+    "demo": demo_command,
     "inspect": inspect_command,
     "train": train_command,
-    "evaluate": evaluate_command,
-    "predict": predict_command,
-    "compare": compare_command,
-    "sweep": sweep_command,
-    "stream": stream_command,
-    "export": export_command,
     "impute": impute_command,
     "forecast": forecast_command,
     "resample": resample_command,
+    "predict": predict_command,
+    "evaluate": evaluate_command,
+    "stream": stream_command,
+    "export": export_command,
+    "models": models_command,
+    "simulate": simulate_command,
+    "compare": compare_command,
+    "sweep": sweep_command,
     "clone": clone_command,
     "rollout": rollout_command,
-    "demo": demo_command,
-    "models": models_command,
     "doctor": doctor_command,
 }
 
@@ -137,13 +137,15 @@ def run_commands(
     if sys.stderr is None:  # closed by the caller; progress bars and notes need one
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     groups = {"reader": reader_options, "training": training_options}
-    parser = CommandParser(prog=prog, description=description, version=__version__)
+    usage = f"{prog} COMMAND [options] ..."
+    parser = CommandParser(prog=prog, usage=usage, description=description, version=__version__)
     subcommands = parser.add_subcommands()
     names: dict[str, str] = {}
     parsers: dict[str, CommandParser] = {}
     for command, function in commands.items():
-        about = inspect.cleandoc(function.__doc__ or "").partition("\n\n")[0]
-        parsers[command] = CommandParser(function, groups, FREQUENT.get(command), description=about)
+        said = inspect.cleandoc(function.__doc__ or "").partition("\n\nArgs:")[0]
+        about = said.partition("\n\n")[0]
+        parsers[command] = CommandParser(function, groups, FREQUENT.get(command), description=said)
         aliases = ALIASES.get(command, ())
         subcommands.add_subcommand(command, parsers[command], help=about, aliases=aliases)
         parsers[command].prog = f"{prog} {command}"

@@ -33,8 +33,8 @@ def clone_command(
     Args:
         data: the demonstrations, of any format that Offbeat reads; a trajectory each.
         out: folder of the policy; an existing one is replaced.
-        actions: channels that are actions, such as --actions '[torque]'; by default those that the
-            file says are.
+        actions: names of the channels that are actions, such as --actions torque; by default those
+            that the file marks as such.
         model: name of a model, as offbeat models lists them.
         low: lowest action per channel; by default the lowest of the demonstrations.
         high: highest action per channel.
@@ -42,14 +42,14 @@ def clone_command(
             has its own.
         sensor_drop: fraction of the values of each channel that are missing besides, at most.
         bursts: fraction of the time in outages of 0.1 to 0.5 s, at most.
-        loss: of the actions, mse or nll.
+        loss: loss of the actions, mse or nll.
         epochs: passes over the demonstrations.
-        window: rows of the windows that are trained on.
-        learning_rate: at the start.
+        window: rows of each training window.
+        learning_rate: learning rate at the start.
         validation: fraction of the demonstrations by which the best epoch is chosen; 0 keeps the
             last one.
-        reader: how the demonstrations are read.
-        seed: of everything random.
+        reader: options of reading the demonstrations.
+        seed: seed of everything random.
         json: print the result as JSON.
     """
     from dataclasses import replace

@@ -45,8 +45,8 @@ def compare_command(
         alpha: significance level.
         confidence: level of the confidence intervals.
         resamples: number of bootstrap samples.
-        seed: of the bootstrap.
-        form: of what is printed: text, markdown or latex.
+        seed: seed of the bootstrap.
+        form: form of what is printed: text, markdown or latex.
         out: file for the comparison: .txt, .md, .tex or .json.
         figure: file for the critical-difference diagram of three or more models: .png, .pdf or
             .svg.

@@ -8,11 +8,11 @@ from offbeat.cli.common import say
 
 
 def demo_command(out: Path = Path("runs/demo"), seed: int = 0, json: bool = False) -> None:
-    """Fill the dropouts of an arm and predict a hopper, with models trained here and shipped ones.
+    """Fill the dropouts of an arm and predict a hopper, with models trained now and trained before.
 
     Args:
         out: folder for the scores, the figures, the animations and the trained models.
-        seed: of windows, masks, splits, weights, batches and tasks.
+        seed: seed of windows, masks, splits, weights, batches and tasks.
         json: print the scores as JSON.
     """
     from offbeat.demo import run_demo

@@ -45,7 +45,7 @@ def evaluate_command(
     channels' units and, over all channels, in scaled units.
 
     Args:
-        model: folder of a run or of a checkpoint.
+        model: folder of a run or of a saved model.
         data: the log, of any format that Offbeat reads.
         part: test, validation, train or all. On the data of the run, the windows, masks and split
             of the training are made again, and test is the default; other data is scored as a
@@ -54,19 +54,19 @@ def evaluate_command(
         mask: what is masked: rows, values, bursts or dropout.
         burst_rows: length of a burst or of a dropout in rows.
         burst_s: length of a burst or of a dropout in seconds, instead of in rows.
-        horizons: of the forecasts in seconds, such as --horizons 0.1,0.5; of a blend, by default
-            parts of the longest one that it was trained for.
+        horizons: seconds of the forecasts after the last row, such as --horizons 0.1,0.5; for a
+            blend, by default fractions of the longest one that it was trained for.
         out: JSON file for the scores.
         figure: .png, .pdf or .svg of one trajectory, its masked values and the fills.
         calibration: .png, .pdf or .svg of the intervals: how many values are within those of each
             level, and how wide they are by the time since an observation.
-        channels: to plot; by default the first four.
-        trajectory: to plot, counted from 0 within the part.
-        reader: how the log is read. What is not given is read as in training, unless a format is
+        channels: names of the channels to plot; by default the first four.
+        trajectory: number of the trajectory to plot, counted from 0 within the part.
+        reader: options of reading the log; by default those of the training, unless a format is
             given.
-        seed: of the mask, and of models with self-feeding.
-        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
-            from it.
+        seed: seed of the mask, and of models that draw random numbers.
+        device: device that computes the models: cpu, cuda, cuda:1, or auto, which takes a GPU
+            where it is faster.
         json: print the scores as JSON.
     """
     from offbeat.answers.blend import Blend

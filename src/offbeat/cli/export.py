@@ -18,7 +18,7 @@ def export_command(model: Path, out: Path, to: str = "onnx", json: bool = False)
     backend.
 
     Args:
-        model: folder of a run or of a checkpoint.
+        model: folder of a run or of a saved model.
         out: file to write; .onnx for ONNX.
         to: format of the file: onnx or cpp.
         json: print what was written as JSON.

@@ -30,10 +30,10 @@ def forecast_command(
     device: str = "cpu",
     json: bool = False,
 ) -> None:
-    """Forecast what follows the last row of a log, in original units.
+    """Forecast what follows the last row of a log, in the units of the log.
 
     Args:
-        model: folder of a run or of a checkpoint.
+        model: folder of a run or of a saved model.
         data: the log, of any format that Offbeat reads.
         out: .csv or .parquet file with columns trajectory, time (s), horizon (s after the last
             row), one per channel, and one `name|observed` per channel, which is false: these values
@@ -42,12 +42,12 @@ def forecast_command(
         horizons: seconds after the last row, such as --horizons 0.1,0.5,1.0.
         figure: .png, .pdf or .svg of the end of one trajectory, the forecast, last value and
             constant velocity.
-        channels: to plot; by default the first four.
-        trajectory: to plot, counted from 0.
-        reader: how the log is read. What is not given is read as in training, unless a format is
+        channels: names of the channels to plot; by default the first four.
+        trajectory: number of the trajectory to plot, counted from 0.
+        reader: options of reading the log; by default those of the training, unless a format is
             given.
-        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
-            from it.
+        device: device that computes the models: cpu, cuda, cuda:1, or auto, which takes a GPU
+            where it is faster.
         json: print what was written as JSON.
     """
     import numpy as np

@@ -34,10 +34,10 @@ def impute_command(
     device: str = "cpu",
     json: bool = False,
 ) -> None:
-    """Fill every value of a log that was not observed, in original units.
+    """Fill every value of a log that was not observed, in the units of the log.
 
     Args:
-        model: folder of a run or of a checkpoint.
+        model: folder of a run or of a saved model.
         data: the log, of any format that Offbeat reads; missing and masked values are filled.
         out: .csv or .parquet file with columns trajectory, time (s), one per channel, and one
             `name|observed` per channel: true where the value was measured, false where it was
@@ -49,15 +49,15 @@ def impute_command(
         rate_hz: add rows at this rate where no row is within half a period, so that times at which
             no sensor reported are filled too. The log is then not split at outages, unless
             --reader.max_gap_s is given.
-        format: to write, such as minari; by default found by the name of out.
+        format: format to write, such as minari; by default that of the suffix of out.
         figure: .png, .pdf or .svg of one trajectory, its fills, linear interpolation and PCHIP.
-        channels: to plot; by default the first four.
-        trajectory: to plot, counted from 0.
-        reader: how the log is read. What is not given is read as in training, unless a format is
+        channels: names of the channels to plot; by default the first four.
+        trajectory: number of the trajectory to plot, counted from 0.
+        reader: options of reading the log; by default those of the training, unless a format is
             given.
-        seed: of models with self-feeding.
-        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
-            from it.
+        seed: seed of models that draw random numbers (those trained with --model.self_feeding).
+        device: device that computes the models: cpu, cuda, cuda:1, or auto, which takes a GPU
+            where it is faster.
         json: print what was written as JSON.
     """
     from offbeat.answers.impute import impute

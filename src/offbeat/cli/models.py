@@ -9,7 +9,7 @@ def models_command(name: str | None = None, json: bool = False) -> None:
     """List the trained models that come with Offbeat, or show the card of one.
 
     Args:
-        name: of a model, such as offbeat/hopper-30-ode_gru_d; its card is printed.
+        name: name of a model whose card is printed, such as offbeat/hopper-30-ode_gru_d.
         json: print as JSON.
     """
     from offbeat.models.hub import CARD, trained_folder, trained_models

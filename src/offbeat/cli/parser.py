@@ -22,7 +22,6 @@ import yaml
 from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first unseen
     ActionConfigFile,
     ArgumentParser,
-    DefaultHelpFormatter,
     Namespace,
     get_loader,
     set_loader,
@@ -30,6 +29,7 @@ from jsonargparse import (  # type: ignore[attr-defined]  # it exports the first
 )
 
 from offbeat import safe_yaml
+from offbeat.cli.help import Formatter, of_commands
 from offbeat.config import ROWS_OR_SECONDS
 
 set_parsing_settings(
@@ -56,13 +56,6 @@ class Option(NamedTuple):
     name: str
     type: Any
     help: str
-
-
-class Formatter(DefaultHelpFormatter):
-    """Keeps the line breaks of the description."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        return "".join(indent + line for line in text.splitlines(keepends=True))
 
 
 class CommandParser(ArgumentParser):
@@ -106,7 +99,8 @@ class CommandParser(ArgumentParser):
             self.function, as_group=False, as_positional=True, sub_configs=True, skip=set(groups)
         )
         for name in sorted(groups):
-            self.add_function_arguments(_function_of(self.groups_of[name]()), name)
+            about = f"Options of the {name}."
+            self.add_function_arguments(_function_of(self.groups_of[name](), about), name)
         actions: list[Any] = list(self._actions)
         for action in actions:
             kind = getattr(action, "_typehint", action.type)
@@ -117,18 +111,22 @@ class CommandParser(ArgumentParser):
                     action.type = _Listed(kind)
                 else:  # any number of them, as a shell passes them
                     action._typehint, action.nargs, action.metavar = kind.__args__[0], "+", None
+            if action.dest in groups:
+                action.help = "YAML file with the options of this group."
         paths = (action.dest for action in actions if not action.option_strings)
-        self.usage = f"{self.prog} [options] {' '.join(paths)}"
+        self.usage = " ".join([self.prog, "[options]", *paths])
 
     def format_help(self, formatter: Any = None) -> str:
         """The help with the frequent options alone, in their order."""
         if self.function is None:
-            return str(super().format_help(formatter))
+            return of_commands(self, str(super().format_help(formatter)))
         self.fill()
         actions = {a.option_strings[0].lstrip("-"): a for a in self._actions if a.option_strings}
+        groups = {name.partition(".")[0] for name in actions if "." in name}
         names = self.frequent or [name for name in actions if "." not in name]
-        first = ["help", "config", "quiet", "verbose"]
-        names = [*dict.fromkeys([*(n for n in names if n not in ("h", "print_config")), *first])]
+        last = ["help", "config", "quiet", "verbose"]
+        others = {"h", "print_config", *groups, *last}
+        names = [*(name for name in names if name not in others), *last]
         shown = [actions["h" if name == "help" else name] for name in names]
         formatter = formatter or self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
@@ -319,14 +317,14 @@ class _Listed:
         return re.sub(r"\b[a-z_]+\.(?=\w)", "", str(self.kind)).replace("NoneType", "null")
 
 
-def _function_of(options: Sequence[Option]) -> Callable[..., None]:
+def _function_of(options: Sequence[Option], about: str) -> Callable[..., None]:
     """Makes a function with these options as arguments without defaults."""
 
     def function() -> None:
         pass
 
     function.__doc__ = "\n".join(
-        ["Options.", "", "Args:", *(f"    {option.name}: {option.help}" for option in options)]
+        [about, "", "Args:", *(f"    {option.name}: {option.help}" for option in options)]
     )
     function.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [

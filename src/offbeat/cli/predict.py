@@ -31,7 +31,7 @@ def predict_command(
     original units.
 
     Args:
-        model: folder of a run or of a checkpoint.
+        model: folder of a run or of a saved model.
         data: the log, of any format that Offbeat reads.
         out: .csv or .parquet file with columns trajectory, time (s, as times), clock_UNIT (what the
             clock of the log shows, in its own unit, where that differs) and one per channel. With
@@ -43,11 +43,11 @@ def predict_command(
             prediction is the model's initial one.
         time_unit: unit of the times in a CSV: s, ms, us or ns; by default found in its header or
             its numbers. It does not change the unit of --times.
-        reader: how the log is read. What is not given is read as in training, unless a format is
+        reader: options of reading the log; by default those of the training, unless a format is
             given.
-        seed: of models with self-feeding.
-        device: that models are computed on: cpu, cuda, cuda:1, or auto for a GPU where they gain
-            from it.
+        seed: seed of models that draw random numbers (those trained with --model.self_feeding).
+        device: device that computes the models: cpu, cuda, cuda:1, or auto, which takes a GPU
+            where it is faster.
         json: print what was written as JSON.
     """
     from offbeat.answers.predict import predict

@@ -34,9 +34,9 @@ def resample_command(
         rate_hz: rows per second. A log that was split at outages has even times in each part.
         run: folder of a run that fills the gaps; by default a blend of line, PCHIP and Kalman
             smoother does, which is fitted to the log.
-        format: to write, such as minari; by default found by the name of out.
+        format: format to write, such as minari; by default that of the suffix of out.
         reader: how the log is read. What is not given is read as in training of the run.
-        seed: of models with self-feeding, and of the simple fill.
+        seed: seed of the simple fill, and of models that draw random numbers.
         json: print what was written as JSON.
     """
     from offbeat.answers.resample import resample

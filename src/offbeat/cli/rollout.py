@@ -32,12 +32,12 @@ def rollout_command(
         drop: fraction of the frames that are lost.
         sensor_drop: fraction of the values of each channel that are missing besides.
         bursts: fraction of the time in outages.
-        burst_s: s, shortest and longest outage; by default 0.1 and 0.5.
-        delay_s: s from a measurement to its arrival.
-        jitter_s: s, largest error of a stamp.
-        steps: that an episode is cut off after; by default as the environment says.
-        dt: s per step; by default as the environment says.
-        seed: of the first episode; that of the next one is one more.
+        burst_s: shortest and longest outage in seconds; by default 0.1 and 0.5.
+        delay_s: seconds from a measurement to its arrival.
+        jitter_s: largest error of a time stamp, in seconds.
+        steps: steps after which an episode ends; by default as the environment says.
+        dt: seconds per step; by default as the environment says.
+        seed: seed of the first episode; each further one adds 1.
         json: print every return as JSON.
     """
     from offbeat.policies import Policy, rollout

@@ -41,7 +41,7 @@ def scored(
         dataset: its masked values, if any, are imputed and scored.
         evaluation: the model's one-step-ahead scores.
         horizons: s; None scores no forecasts of a model, and those of a blend up to its horizon.
-        seed: of models with self-feeding.
+        seed: seed of models that draw random numbers (those trained with --model.self_feeding).
         calibration: file of a figure of the coverage and the widths of intervals.
 
     Raises:
@@ -121,7 +121,7 @@ def fill_figure(
         number: of the trajectory.
         mode: as of `impute`.
         rate_hz: as of `impute`.
-        seed: of models with self-feeding.
+        seed: seed of models that draw random numbers (those trained with --model.self_feeding).
     """
     truth = dataset.select(model.names)[number]
     one = replace(dataset, trajectories=(dataset[number],))

@@ -22,10 +22,10 @@ def simulate_command(
     Args:
         out: Parquet file to write.
         robot: hopper, walker, cheetah, humanoid, an MJCF file, or one of Gymnasium, as Hopper-v5.
-        n_trajectories: how many, each from its own random state.
+        n_trajectories: number of trajectories, each from its own random state.
         rows: rows per trajectory; one per physics step, 5 ms for the hopper.
-        seed: of the initial states; the thesis' protocol uses 123.
-        threads: of the simulation; all cores by default. The result does not depend on it.
+        seed: seed of the initial states; the thesis' protocol uses 123.
+        threads: threads of the simulation; by default all cores. The result does not depend on it.
         json: print what was written as JSON.
     """
     from offbeat.data.simulate import simulate

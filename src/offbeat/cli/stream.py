@@ -27,15 +27,15 @@ def stream_command(
     ends at the end of the input or on SIGTERM, once every line that had arrived is answered.
 
     Args:
-        model: folder of a run or of a checkpoint, or a file that `offbeat export` wrote.
+        model: folder of a run or of a saved model, or a file that `offbeat export` wrote.
         options: what is done with messages that are late, repeated, stale or on another clock.
         horizon_s: predict this many seconds after the newest row; by default each row is predicted
             at its own time, before its values are used.
-        time_unit: of all times: s, ms, us or ns. Integers are exact.
+        time_unit: unit of all times: s, ms, us or ns. Integers are exact.
         state: JSON file with the state of a stream: restored if the file exists, written at the
             end.
-        seed: of models with self-feeding.
-        device: that the model is computed on: cpu, cuda, cuda:1 or auto.
+        seed: seed of models that draw random numbers (those trained with --model.self_feeding).
+        device: device that computes the model: cpu, cuda, cuda:1 or auto.
         stats: print latencies and counters as JSON on standard error at the end.
     """
     import json

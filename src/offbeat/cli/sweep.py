@@ -43,7 +43,7 @@ def sweep_command(
             and curves.csv with a row per epoch, status.json, runs; offbeat compare reads it.
         models: names of models, as in --models gru_d,ode_rnn; by default gru_d, ode_rnn and
             anchored_ode_gru_d. A sweep can be continued with more.
-        repeats: how many; three are the least for a comparison, ten are better. A sweep can be
+        repeats: number of repeats; a comparison needs three, ten are better. A sweep can be
             continued with more.
         split: windows, masked values, and the split; its seed is that of the first repeat.
         training: epochs, optimizer and the rest, where they differ from each model's recipe.
@@ -51,11 +51,11 @@ def sweep_command(
             part.
         engine: local (processes of this machine), ray or slurm.
         processes: runs at a time; by default as many as cores and memory allow.
-        threads: of each run.
-        device: that models are trained on: cpu, cuda, cuda:1, or auto for a GPU where there is one.
+        threads: threads of each run.
+        device: device that trains the models: cpu, cuda, cuda:1, or auto, a GPU where there is one.
         together: runs of equal shape that are trained in one process and take their steps at once;
             by default 32 on a GPU with the triton backend, else 1.
-        budget_minutes: stop after so long; the same command continues later.
+        budget_minutes: minutes after which to stop; the same command continues later.
         mixed: where out has runs of other code, of another processor, backend, torch or data,
             refuse to continue, accept them (the record marks them), or redo them.
         engine_options: as JSON; for ray, arguments of ray.init, for slurm of submitit's

@@ -44,8 +44,8 @@ def train_command(
     """Train on a log for predictions, fills and forecasts with intervals, and score all of them.
 
     No option is needed. How the log is cleaned and split, its sensors, and the longest forecast are
-    found in it, and said. A few models are tried, the best on validation is trained forward and
-    backward, and blended with simple predictors so that the answers lose to none of these.
+    found in it, and printed. A few models are tried. The best on validation data is trained forward
+    and backward, and blended with simple predictors by their errors on validation data.
 
     Started by torchrun, all ranks train one model, which has to be given: each takes its part of
     every batch, and the first one writes the run.
@@ -54,9 +54,10 @@ def train_command(
         data: the log, of any format that Offbeat reads.
         out: folder of the run: config.yaml, log.csv, checkpoints, models, blend, results.json. A
             run that was stopped continues from its last checkpoint.
-        horizon_s: s, the longest forecast that will be asked for; by default found in the log.
-        model: to train, with its options; by default the best of a few on validation.
-        training: options of the training, those that differ from the recipe.
+        horizon_s: longest forecast that will be asked for, in seconds; by default found in the
+            log.
+        model: model to train, with its options; by default the best of a few on validation data.
+        training: options of the training that differ from the recipe of the model.
         split: windows, masked values, and the split into training, validation and test part. By
             default found in the log. With observed_fraction, and for a data set of Offbeat, models
             are trained on these windows and masks instead of the tasks that will be asked.
@@ -67,14 +68,15 @@ def train_command(
         baselines: names of the simple predictors that answers are blended with, such as
             [last_value,ridge,pchip]; by default all for logs, and those that are fitted at once
             for a data set of Offbeat.
-        budget_minutes: time for trainings, baselines and blend, about, where the model is chosen.
-        reader: how the log is read; the run keeps these options for the other commands.
+        budget_minutes: about how long training may take in all, in minutes, where no model is
+            named.
+        reader: options of reading the log; the run keeps them for the other commands.
         lazy: read the files of a folder of data sets of Offbeat when they are needed, and never
             all at once; by default where they need more than a quarter of the available memory.
-        seed: of the initial weights.
-        threads: of torch; one is fastest for models of this size.
-        device: that the model is trained on: cpu, cuda, cuda:1, or auto for a GPU where there is a
-            gain.
+        seed: seed of the initial weights and of the order of training.
+        threads: threads of PyTorch; one is fastest for models of this size.
+        device: device that trains the model: cpu, cuda, cuda:1, or auto, which takes a GPU where
+            it is faster.
         json: print the scores as JSON.
     """
     import torch

@@ -55,7 +55,7 @@ def recordings(
 
     Args:
         path: the file.
-        topics: messages to read with all their instances; by default those of `DEFAULTS`.
+        topics: messages to read with all their instances; by default those of the motion.
         fields: fields to read, `GyrX`, or of one message alone, `IMU:GyrX`; by default all numbers.
 
     Yields:

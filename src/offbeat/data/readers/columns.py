@@ -12,7 +12,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from offbeat.data.cleaning.clocks import is_rest, split_stamps, split_unit
-from offbeat.data.readers.sensors import instance_column, long_form, turns_of
+from offbeat.data.readers.sensors import (
+    instance_column,
+    long_form,
+    turns_of,
+    unit_column,
+    units_by_key,
+)
 from offbeat.data.readers.stamp_columns import stamp_columns
 from offbeat.data.readers.table_options import (
     LABEL_NAMES,
@@ -90,8 +96,11 @@ class Columns:
             stamp.time, label, (), (), (), rest=stamp.rest, rest_unit=stamp.rest_unit,
             notes=stamp.notes,
         )  # fmt: skip
-        key, value = long_form(rest, options, sample)
+        of_units = unit_column(rest, sample)
+        beside = [name for name in rest if name != of_units]
+        key, value = long_form(beside, options, sample)
         if key is not None and value is not None:
+            units, noted = ({}, ()) if of_units is None else units_by_key(key, of_units, sample)
             return replace(
                 found,
                 channels=(value,),
@@ -99,7 +108,8 @@ class Columns:
                 units=("",),
                 key=key,
                 chosen=None if options.channels is None else tuple(options.channels),
-                stated=dict(options.units or {}),
+                stated={**units, **(options.units or {})},
+                notes=(*found.notes, *noted),
             )
         key = instance_column(stamp, rest, options, sample)
         if key is not None:

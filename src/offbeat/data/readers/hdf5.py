@@ -86,7 +86,7 @@ def recordings(
             rows are assumed to be 1 s apart, which is noted.
         time_column: array of the times, among the observations or beside them, such as
             `timestamps`, or two that hold the stamp together, as `[sec, nanosec]`; by default found
-            by their names, see `TIME_NAMES`.
+            by their names, such as `time` or `stamp`.
         time_unit: unit of those times; by default from their name, else detected.
 
     Yields:

@@ -46,9 +46,9 @@ def read_npz(
     Args:
         path: the file.
         time_column: the array of times, or two that hold the stamp together, as `[sec, nanosec]`;
-            by default found by its name, see `TIME_NAMES`.
+            by default found by its name, such as `time` or `stamp`.
         trajectory_column: the array, of shape (rows,), with the trajectory of each row;
-            by default found by its name, see `LABEL_NAMES`.
+            by default found by its name, such as `episode`.
         channels: the channels to read, in this order; by default all.
         without: arrays or channels to leave out.
         time_unit: `s`, `ms`, `us`, `100ns`, `ns`, `min`, `h` or `d`; by default from the array's

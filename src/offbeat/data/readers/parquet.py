@@ -46,9 +46,9 @@ def read_parquet(
     Args:
         path: the file.
         time_column: the column of times, or two that hold the stamp together; by default found by
-            its name, see `TIME_NAMES`, or the index of pandas where it holds time stamps.
+            its name, such as `time` or `stamp`, or the index of pandas where it holds time stamps.
         trajectory_column: the column with the trajectory of each row; by default found
-            by its name, see `LABEL_NAMES`.
+            by its name, such as `episode`.
         channels: the columns to read as channels, in this order; by default all numbers.
         without: columns to leave out.
         time_unit: `s`, `ms`, `us`, `100ns`, `ns`, `min`, `h` or `d`; by default from the column's

@@ -12,6 +12,7 @@ from offbeat.data.readers.stamps import form_of
 from offbeat.data.readers.table_options import (
     INSTANCE_NAMES,
     KEY_NAMES,
+    UNIT_NAMES,
     VALUE_NAMES,
     Sample,
     TableOptions,
@@ -66,6 +67,38 @@ def long_form(
     if value is None:
         value = one_of("value_column", "", left)
     return key, value
+
+
+def unit_column(rest: list[str], sample: Sample) -> str | None:
+    """The column with the unit of each value in a table of the long form, or None.
+
+    Args:
+        rest: the columns besides the stamp and the label.
+        sample: the first values.
+    """
+    named = [name for name in rest if folded(name) in UNIT_NAMES]
+    return named[0] if len(named) == 1 and sample.is_text(named[0]) else None
+
+
+def units_by_key(key: str, of_units: str, sample: Sample) -> tuple[dict[str, str], tuple[str, ...]]:
+    """The unit of each channel in the first rows, and a note where one has several.
+
+    Args:
+        key: the column with the channel of each value.
+        of_units: the column with its unit.
+        sample: the first values.
+    """
+    met: dict[str, set[str]] = {}
+    for channel, unit in zip(sample.texts(key), sample.texts(of_units), strict=False):
+        if channel and unit.strip():
+            met.setdefault(channel, set()).add(unit.strip())
+    several = [channel for channel, units in met.items() if len(units) > 1]
+    notes = tuple(
+        f"{channel!r} has several units in column {of_units!r} ({', '.join(sorted(met[channel]))}) "
+        "and is read without one; convert its values, and state the unit with units"
+        for channel in several[:3]
+    )
+    return {channel: min(found) for channel, found in met.items() if len(found) == 1}, notes
 
 
 def instance_column(

@@ -56,9 +56,9 @@ def read_csv(
     Args:
         path: the file.
         time_column: the column of times, or two that hold the stamp together, as `[sec, nanosec]`
-            and `[Date, Time]`; by default found by their names, see `TIME_NAMES`.
+            and `[Date, Time]`; by default found by their names, such as `time` or `stamp`.
         trajectory_column: the column with the trajectory of each row, as a number or
-            any text; by default found by its name, see `LABEL_NAMES`. Without one, the file is one
+            any text; by default found by its name, such as `episode`. Without one, the file is one
             trajectory.
         channels: the columns to read as channels (in the long form: their names in the column of
             channels), in this order; by default all numbers.

@@ -27,6 +27,9 @@ KEY_NAMES = (
 VALUE_NAMES = ("value", "val", "data", "reading")
 """Names of the two columns of long tables besides the time, in any case."""
 
+UNIT_NAMES = ("unit", "units", "uom")
+"""Names of the column with the unit of each value in a long table, in any case."""
+
 INSTANCE_NAMES = ("i", "instance", "multi_id", "imu", "id", "index", "motor", "joint", "sensor")
 """Names of columns with the number of the sensor of a row, in any case."""
 

@@ -68,7 +68,7 @@ def recordings(
     Args:
         path: the file.
         topics: topics to read with all their instances (`sensor_accel`), or with one
-            (`sensor_accel:1`); by default those of `DEFAULTS`.
+            (`sensor_accel:1`); by default those of the motion.
         fields: fields to read, such as `q` (with all its elements) or `gyro_rad[0]`, or, of one
             topic alone, `vehicle_attitude:q`; by default all numbers of the topics that were asked
             for, except further stamps.
