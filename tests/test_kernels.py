@@ -333,7 +333,7 @@ def test_batches_of_any_width_have_the_same_bits(model: str, name: str) -> None:
 
 
 @needs_cpu
-@pytest.mark.parametrize("batch", [1, 2, 3, 4, 5, 17, 18, 19, 20, 21])
+@pytest.mark.parametrize("batch", [1, 2, 3, 4, 5, 9, 12, 17, 18, 19, 20, 21, 36, 50])
 def test_narrow_blocks_have_the_gradients_of_the_reference(batch: int) -> None:
     for options in BITS.values():
         case = problem(seed=9, batch=batch, rows=6, channels=4, hidden=9, **options)

@@ -3,6 +3,7 @@
 // Applied to each vector of a product before it is stored; the argument is its offset.
 struct Plain {
   INLINE V operator()(V a, int64_t) const { return a; }
+  INLINE void soon(int64_t) const {}
 };
 struct TimesTanhSlope {  // the derivative of tanh, computed from its value
   const T* value;
@@ -10,15 +11,28 @@ struct TimesTanhSlope {  // the derivative of tanh, computed from its value
     const V y = load<T>(value + i);
     return a * fma(-y, y, splat(1));
   }
+  // The tape comes from an outer cache, which a sum hides if it is asked for before.
+  INLINE void soon(int64_t i) const { __builtin_prefetch(value + i); }
+};
+
+// tanh, stored where the backward pass finds it.
+struct Tanh {
+  T* value;
+  INLINE V operator()(V a, int64_t) const { return tanh_(a); }
+  INLINE void soon(int64_t i) const { __builtin_prefetch(value + i, 1); }
 };
 
 // y[o] = (accumulate ? y[o] : bias[o]) + sum over k of w[o][k] x[k], k in order. P panels at a time:
 // their sums do not depend on each other, and a multiply-add takes several cycles.
-template <int P, int NV, bool ACCUMULATE, class Finish>
+// `W` is the stride of a unit.
+template <int P, int NV, int W, bool ACCUMULATE, class Finish>
 static INLINE void panels(const T* w, const T* bias, int rows, int in, const T* x, T* y, int64_t at,
                           const Finish& finish) {
   y += at;
-  constexpr int W = NV * VW, R = P * TILE;
+  constexpr int R = P * TILE;
+  for (int r = 0; r < R; ++r)
+    if (r < rows)
+      for (int v = 0; v < NV; ++v) finish.soon(at + r * W + v * VW);
   V acc[R][NV];
   for (int r = 0; r < R; ++r)
     for (int v = 0; v < NV; ++v) {
@@ -52,16 +66,23 @@ static constexpr int panels_at_once() {
 // The same for `LANES` lanes of a vector that is mostly empty: vectors run over the outputs of
 // several panels, so that unused lanes cost nothing. They are set to 0. `X` is such a vector, or
 // four floats for the last panels.
-template <int LANES, class X, class Finish>
+template <int LANES, int W, class X, class Finish>
 static INLINE void few_store(const X (&acc)[LANES], int rows, T* y, int64_t at,
                              const Finish& finish) {
   for (int r = 0; r < int(sizeof(X) / sizeof(T)) && r < rows; ++r) {
     V lanes = splat(0);
     for (int lane = 0; lane < LANES; ++lane) lanes[lane] = acc[lane][r];
-    store<T>(y + at + r * VW, finish(lanes, at + r * VW));
+    store<T>(y + at + r * W, finish(lanes, at + r * W));
   }
 }
-template <int LANES, int N, class X, bool ACCUMULATE, class Finish>
+template <class X>
+static INLINE X load_wide(const T* p) {
+  if constexpr (sizeof(X) / sizeof(T) == TILE)
+    return load_four(p);
+  else
+    return load<T>(p);
+}
+template <int LANES, int N, class X, int W, bool ACCUMULATE, class Finish>
 static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const T* x, T* y,
                               int64_t at, const Finish& finish) {
   static_assert(TILE == 4, "a panel is four floats wide");
@@ -71,9 +92,14 @@ static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const
     for (int lane = 0; lane < LANES; ++lane)
       for (int r = 0; r < WIDE; ++r) {
         const int o = n * WIDE + r;
-        acc[n][lane][r] =
-            ACCUMULATE ? (o < rows ? y[at + o * VW + lane] : T(0)) : (bias ? bias[o] : T(0));
+        if (ACCUMULATE) acc[n][lane][r] = o < rows ? y[at + o * W + lane] : T(0);
       }
+  if (!ACCUMULATE)
+    for (int n = 0; n < N; ++n) {
+      X start{};
+      if (bias) start = load_wide<X>(bias + n * WIDE);
+      for (int lane = 0; lane < LANES; ++lane) acc[n][lane] = start;
+    }
   const int64_t panel = int64_t(TILE) * in;
   for (int k = 0; k < in; ++k)
     for (int n = 0; n < N; ++n) {
@@ -84,7 +110,7 @@ static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const
       else
         wv = load_fours(from, panel);
       for (int lane = 0; lane < LANES; ++lane) {
-        const T xv = x[int64_t(k) * VW + lane];
+        const T xv = x[int64_t(k) * W + lane];
         if constexpr (WIDE == TILE)
           acc[n][lane] = fma_four(wv, xv - F4{}, acc[n][lane]);
         else
@@ -92,24 +118,25 @@ static INLINE void few_panels(const T* w, const T* bias, int rows, int in, const
       }
     }
   for (int n = 0; n < N; ++n)
-    few_store<LANES>(acc[n], rows - n * WIDE, y, at + int64_t(n) * WIDE * VW, finish);
+    few_store<LANES, W>(acc[n], rows - n * WIDE, y, at + int64_t(n) * WIDE * W, finish);
 }
-template <int LANES, bool ACCUMULATE, class Finish>
-static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y,
+template <int LANES, int W, bool ACCUMULATE, class Finish>
+static NOINLINE void few(const T* w, const T* bias, int out, int in, const T* x, T* y, int64_t at,
                          const Finish& finish) {
   constexpr int N = (VECTOR_BYTES == 64 ? 12 : 8) / LANES;
   int o = 0;
   auto panels = [&](auto wide, auto n) {
     using X = decltype(wide);
     constexpr int MOST = n(), OUT = MOST * int(sizeof(X) / sizeof(T));
-    few_panels<LANES, MOST, X, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
-                                           out - o < OUT ? out - o : OUT, in, x, y,
-                                           int64_t(o) * VW, finish);
+    few_panels<LANES, MOST, X, W, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
+                                              out - o < OUT ? out - o : OUT, in, x, y,
+                                              at + int64_t(o) * W, finish);
     o += OUT;
   };
-  while (o + N * VW <= out) panels(V{}, Count<N>{});
-  while (o + 2 * VW <= out) panels(V{}, Count<2>{});
-  while (o + VW <= out) panels(V{}, Count<1>{});
+  const int padded = up(out, TILE);  // of the weights
+  while (o + N * VW <= padded) panels(V{}, Count<N>{});
+  while (o + 2 * VW <= padded) panels(V{}, Count<2>{});
+  while (o + VW <= padded) panels(V{}, Count<1>{});
   while (o < out) panels(F4{}, Count<1>{});
 }
 template <int N>
@@ -128,6 +155,10 @@ struct Many {
     product<ACCUMULATE>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out,
                         m.in, lanes, x, y, Plain{});
   }
+  static NOINLINE void tanh_affine(const Matrix& m, const T* packed, int lanes, const T* x, T* y) {
+    product<false>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out, m.in,
+                   lanes, x, y, Tanh{y});
+  }
   // x[k] (+)= sum over o of w[o][k] y[o]
   template <bool ACCUMULATE>
   static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
@@ -142,20 +173,33 @@ struct Many {
   template <bool ACCUMULATE, class Finish>
   static INLINE void product(const T* w, const T* bias, int out, int in, int lanes, const T* x,
                              T* y, const Finish& finish) {
-    if constexpr (NV == 1 && sizeof(T) == 4) {
-      if (lanes == 1) return few<1, ACCUMULATE>(w, bias, out, in, x, y, finish);
-      if (lanes == 2) return few<2, ACCUMULATE>(w, bias, out, in, x, y, finish);
-      if (VW > 4 && lanes == 3) return few<3, ACCUMULATE>(w, bias, out, in, x, y, finish);
-      if (VW > 4 && lanes == 4) return few<4, ACCUMULATE>(w, bias, out, in, x, y, finish);
+    if constexpr (sizeof(T) == 4) {  // the last vector may have few lanes
+      constexpr int FULL = (NV - 1) * VW;
+      const int n = lanes - FULL;
+      auto rest = [&](auto count) {
+        if constexpr (FULL > 0) whole<NV - 1, ACCUMULATE>(w, bias, out, in, x, y, finish);
+        few<count(), W, ACCUMULATE>(w, bias, out, in, x + FULL, y, FULL, finish);
+      };
+      if (n == 1) return rest(Count<1>{});
+      if (n == 2) return rest(Count<2>{});
+      if (VW > 4 && n == 3) return rest(Count<3>{});
+      if (VW > 4 && n == 4) return rest(Count<4>{});
     }
-    constexpr int P = panels_at_once<NV>(), R = P * TILE;
+    whole<NV, ACCUMULATE>(w, bias, out, in, x, y, finish);
+  }
+  // The first `N` vectors of lanes.
+  template <int N, bool ACCUMULATE, class Finish>
+  static INLINE void whole(const T* w, const T* bias, int out, int in, const T* x, T* y,
+                           const Finish& finish) {
+    constexpr int P = panels_at_once<N>(), R = P * TILE;
     int o = 0;
     for (; P > 1 && o + R <= out; o += R)
-      panels<P, NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, R, in, x, y,
-                                int64_t(o) * W, finish);
+      panels<P, N, W, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, R, in, x, y,
+                                  int64_t(o) * W, finish);
     for (; o < out; o += TILE)
-      panels<1, NV, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
-                                out - o < TILE ? out - o : TILE, in, x, y, int64_t(o) * W, finish);
+      panels<1, N, W, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr,
+                                  out - o < TILE ? out - o : TILE, in, x, y, int64_t(o) * W,
+                                  finish);
   }
   template <class Fn>
   static INLINE void each(int units, Fn fn) {

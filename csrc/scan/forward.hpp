@@ -6,9 +6,15 @@ static NOINLINE void evaluate(const Context<P>& c, const Perceptron& shape, int 
   for (int l = 0; l < shape.layers; ++l) {
     const Matrix& m = c.map.m[first + l];
     const bool last = l == shape.layers - 1;
+    T* value = kept + n.value[l] * P::W;
+    if constexpr (!P::ONE)
+      if (!last && shape.activation == TANH) {
+        P::tanh_affine(m, c.packed, c.lanes, x, value);
+        x = value;
+        continue;
+      }
     P::template affine<false>(m, c.packed, c.lanes, x, last ? out : z);
     if (last) break;
-    T* value = kept + n.value[l] * P::W;
     activate<P>(shape.activation, shape.sizes[l + 1], z, value, kept + n.slope[l] * P::W);
     x = value;
   }
