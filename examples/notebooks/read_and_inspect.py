@@ -17,7 +17,7 @@ print(log)
 
 # %% [markdown]
 # Rows are the union of all stamps, so that none is moved. A value is observed, or it is NaN: most
-# cells are empty, because the sensors never report at the same time.
+# are NaN, because the sensors never report at the same time.
 
 # %%
 first = log[0]

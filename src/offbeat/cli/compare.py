@@ -34,7 +34,7 @@ def compare_command(
     Args:
         runs: folders of runs, folders that hold such folders, or tables with a row per run (.csv,
             .parquet).
-        metric: after_first_observation, masked, after_first_row or published.
+        metric: after_first_observation, masked, after_first_row, or published, the thesis' scoring.
         error: rmse or mse.
         baseline: compare every model with this one, last_value for example; by default every
             model with every other.
