@@ -693,3 +693,35 @@ def test_states_and_slots_that_are_not_there_are_refused() -> None:
         stream.observe(0.0, np.ones(3, np.float32), np.ones(2, bool), False)
     with pytest.raises(ob.InputError, match="out has shape"):
         stream.predict(np.zeros(2), np.empty((1, 2)))
+
+
+@every_set
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"index": np.array([0, 5])}, "an entry of index is 5, expected 0 to 4"),
+        ({"index": np.array([0, -1])}, "an entry of index is -1, expected 0 to 4"),
+        ({"column": 3}, "the first column of the inputs is 3, expected 0 to 2"),
+        ({"targets": (5, 2, 2)}, "rows of the targets is 2, expected 3 to"),
+        ({"targets": (5, 3, 3)}, "targets has shape"),
+        ({"first": (2, 4)}, "first has shape"),
+        ({"states": (2, 1, 5)}, "the number of rows is 1, expected 2 to"),
+        ({"to_states": (2, 4, 3)}, "to_states has shape"),
+        ({"y": (2, 3, 2)}, "y has shape"),
+    ],
+)
+def test_squares_refuse_what_does_not_fit(name: str, change: dict[str, Any], message: str) -> None:
+    shape = compiled.Perceptron([3, 2], 0)
+    given: dict[str, Any] = {
+        "weights": (8,), "states": (2, 4, 5), "first": (2, 5), "column": 2, "targets": (5, 3, 2),
+        "index": np.array([4, 0]), "norm": 1.0, "scale": 1.0, "y": (2, 4, 2), "to_weights": (8,),
+        "to_states": (2, 4, 5),
+    }  # fmt: skip
+
+    def call(**given: Any) -> None:
+        made = {k: np.ones(v, np.float32) if isinstance(v, tuple) else v for k, v in given.items()}
+        compiled.perceptron_squares(shape, name, **made, threads=1)
+
+    call(**given)
+    with pytest.raises(ob.InputError, match=message):
+        call(**given | change)

@@ -342,6 +342,51 @@ def test_narrow_blocks_have_the_gradients_of_the_reference(batch: int) -> None:
 
 @needs_cpu
 @every_set
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+@pytest.mark.parametrize("shifted", [True, False], ids=["of the row before", "of the row"])
+def test_squares_of_a_perceptron_have_the_gradients_of_autograd(
+    name: str, activation: str, shifted: bool
+) -> None:
+    draw = torch.Generator().manual_seed(3)
+    batch, rows, width, column, sizes = 11, 13, 9, 2, (5, 17, 3)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(shape, generator=draw, dtype=torch.float64)
+
+    states, first = (
+        normal(*shape).requires_grad_() for shape in ((batch, rows, width), (1, width))
+    )
+    layers = [
+        (normal(b, a).requires_grad_(), normal(b).requires_grad_())
+        for a, b in itertools.pairwise(sizes)
+    ]
+    targets, index = normal(20, rows + 4, 3), torch.randperm(20, generator=draw)[:batch]
+    start = first.expand(batch, width)
+    read = torch.cat([start[:, None], states[:, :-1]], 1) if shifted else states
+    x = read[..., column : column + sizes[0]]
+    act = {"tanh": torch.tanh, "silu": torch.nn.functional.silu}[activation]
+    for i, (weight, bias) in enumerate(layers):
+        x = torch.nn.functional.linear(act(x) if i else x, weight, bias)
+    loss = torch.nn.functional.mse_loss(x[:, 1:], targets[index][:, : rows - 1])
+    trained = [t for layer in layers for t in layer]
+    expected = torch.autograd.grad(2.5 * loss, [states, *trained])
+    packed = torch.cat([t.detach().reshape(-1) for t in trained])
+    y, to_packed = torch.empty_like(x), torch.empty_like(packed)
+    to_states = torch.zeros_like(states)
+    cpu.compiled.perceptron_squares(
+        cpu.compiled_perceptron(sizes, activation), name, packed.numpy(),
+        states.detach().numpy(), start.detach().contiguous().numpy() if shifted else None, column,
+        targets.numpy(), index.numpy(), 2 / x[:, 1:].numel(), 2.5, y.detach().numpy(),
+        to_packed.numpy(), to_states.numpy(), 2,
+    )  # fmt: skip
+    torch.testing.assert_close(y, x, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(to_states, expected[0], rtol=1e-12, atol=1e-14)
+    gradient = torch.cat([g.reshape(-1) for g in expected[1:]])
+    torch.testing.assert_close(to_packed, gradient, rtol=1e-12, atol=1e-14)
+
+
+@needs_cpu
+@every_set
 def test_when_gradients_of_weights_are_added_changes_no_bit(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

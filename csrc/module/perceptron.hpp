@@ -45,6 +45,25 @@ void perceptron_forward(const Perceptron& shape, const InstructionSet& set, cons
             });
 }
 
+// The backward pass of a job, spread over threads.
+template <class T>
+void perceptron_gradients(PerceptronJob<T>& job, const Kernels<T>& kernels, const T* weights,
+                          T* flat, int threads) {
+  const Perceptron& shape = *job.shape;
+  const Buffer<T> panels("the packed weights", kernels.perceptron_packed_size(shape));
+  kernels.perceptron_pack(shape, weights, panels.get());
+  job.packed = panels.get();
+  const int64_t w = 2 * kernels.width, blocks = (job.n + w - 1) / w;
+  job.slots = int(std::clamp<int64_t>(blocks / 32, 1, 16));
+  const Buffer<T> sums("the gradient of the weights",
+                       times(job.slots, kernels.perceptron_sums(shape)));
+  job.sums = sums.get();
+  spread<T>(job.slots, threads, kernels.perceptron_scratch(shape), [&](int64_t slot, T* scratch) {
+    kernels.perceptron_backward(job, int(slot), scratch);
+  });
+  kernels.perceptron_reduce(shape, sums.get(), job.slots, flat);
+}
+
 template <class T>
 void perceptron_backward(const Perceptron& shape, const InstructionSet& set,
                          const Const<T>& weights, const Const<T>& x, const Const<T>& tape,
@@ -65,16 +84,52 @@ void perceptron_backward(const Perceptron& shape, const InstructionSet& set,
   job.to_y = to_y.data();
   T* flat = to_weights.data();
   nb::gil_scoped_release unlocked;
-  const Buffer<T> panels("the packed weights", kernels.perceptron_packed_size(shape));
-  kernels.perceptron_pack(shape, weights.data(), panels.get());
-  job.packed = panels.get();
-  const int64_t w = 2 * kernels.width, blocks = (job.n + w - 1) / w;
-  job.slots = int(std::clamp<int64_t>(blocks / 32, 1, 16));
-  const Buffer<T> sums("the gradient of the weights",
-                       times(job.slots, kernels.perceptron_sums(shape)));
-  job.sums = sums.get();
-  spread<T>(job.slots, threads, kernels.perceptron_scratch(shape), [&](int64_t slot, T* scratch) {
-    kernels.perceptron_backward(job, int(slot), scratch);
-  });
-  kernels.perceptron_reduce(shape, sums.get(), job.slots, flat);
+  perceptron_gradients<T>(job, kernels, weights.data(), flat, threads);
+}
+
+// Outputs at the states of trajectories, and gradients of their squared errors (records.hpp).
+template <class T>
+void perceptron_squares(const Perceptron& shape, const InstructionSet& set, const Const<T>& weights,
+                        const Const<T>& states, const Maybe<T>& first, int64_t column,
+                        const Const<T>& targets, const Const<int64_t>& index, double norm,
+                        double scale, Array<T> y, Array<T> to_weights, Array<T> to_states,
+                        int threads) {
+  if (states.ndim() != 3)
+    refuse("states has shape " + shape_of(states) + ", expected (trajectories, rows, units)");
+  const int64_t batch = int64_t(states.shape(0)), rows = int64_t(states.shape(1));
+  const int64_t width = int64_t(states.shape(2)), out = shape.sizes[shape.layers];
+  in_range("the number of trajectories", batch, 1, MAX_COUNT);
+  in_range("the number of rows", rows, 2, MAX_COUNT / batch);
+  in_range("the first column of the inputs", column, 0, width - shape.sizes[0]);
+  check_shape("weights", weights, {perceptron_flat(shape)});
+  check_shape("to_weights", to_weights, {perceptron_flat(shape)});
+  check_contiguous("states", states);
+  check_shape("to_states", to_states, {batch, rows, width});
+  check_contiguous("to_states", to_states);
+  check_shape("y", y, {batch, rows, out});
+  check_contiguous("y", y);
+  if (first) {
+    check_shape("first", *first, {batch, width});
+    check_contiguous("first", *first);
+  }
+  if (targets.ndim() != 3) refuse("targets has shape " + shape_of(targets) + ", expected 3 axes");
+  check_shape("targets", targets, {int64_t(targets.shape(0)), int64_t(targets.shape(1)), out});
+  in_range("the number of rows of the targets", int64_t(targets.shape(1)), rows - 1, MAX_COUNT);
+  check_shape("index", index, {batch});
+  for (int64_t i = 0; i < batch; ++i)
+    in_range("an entry of index", index.data()[i], 0, int64_t(targets.shape(0)) - 1);
+  Squares<T> squares;
+  squares.first = first ? first->data() + column : nullptr, squares.rows = rows;
+  squares.targets = targets.data(), squares.index = index.data();
+  squares.by_trajectory = targets.stride(0), squares.by_row = targets.stride(1);
+  squares.norm = T(norm), squares.scale = T(scale);
+  PerceptronJob<T> job;
+  job.shape = &shape;
+  job.x = states.data() + column, job.x_stride = width, job.n = batch * rows;
+  job.to_x = to_states.data() + column;
+  job.y = y.data();
+  job.squares = &squares;
+  T* flat = to_weights.data();
+  nb::gil_scoped_release unlocked;
+  perceptron_gradients<T>(job, typed<T>(set), weights.data(), flat, threads);
 }

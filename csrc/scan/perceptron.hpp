@@ -67,6 +67,49 @@ static void perceptron_forward(const PerceptronJob<T>& job, int64_t block, T* sc
   give_rows<P>(out, n_out, lanes, job.y + first * n_out, n_out);
 }
 
+// A block of rows whose errors are squared: their outputs, and the gradient of those.
+template <class P>
+static void squares_forward(const PerceptronJob<T>& job, const Context<P>& c, const Net& kept,
+                            int64_t first, int lanes, T* tape, T* z, T* out, T* to_out) {
+  const Perceptron& shape = *job.shape;
+  const Squares<T>& q = *job.squares;
+  const int in = shape.sizes[0], n_out = shape.sizes[shape.layers];
+  const T *x[P::W], *target[P::W];
+  T counts[P::W];
+  for (int lane = 0; lane < P::W; ++lane) {
+    const int64_t i = first + (lane < lanes ? lane : 0), one = i / q.rows, row = i % q.rows;
+    counts[lane] = T(lane < lanes && row);
+    target[lane] = q.targets + q.index[one] * q.by_trajectory + (row ? row - 1 : 0) * q.by_row;
+    x[lane] = !q.first ? job.x + i * job.x_stride
+              : row    ? job.x + (i - 1) * job.x_stride
+                       : q.first + one * job.x_stride;
+  }
+  lanes_to_units(x, in, P::W, tape);
+  for (int lane = lanes; lane < P::W; ++lane)
+    for (int u = 0; u < in; ++u) tape[int64_t(u) * P::W + lane] = 0;
+  evaluate<P>(c, shape, M_FIELD, kept, tape, tape + int64_t(in) * P::W, out, z);
+  give_rows<P>(out, n_out, lanes, job.y + first * n_out, n_out);
+  lanes_to_units(target, n_out, P::W, to_out);
+  P::each(n_out, [&](int64_t i, int lane) {
+    const V to = q.norm * (load<T>(out + i) - load<T>(to_out + i)) * q.scale;
+    store<T>(to_out + i, load<T>(counts + lane) != T(0) ? to : splat(0));
+  });
+}
+// The gradient of their inputs. That of the first state is not needed.
+template <class P>
+static void squares_backward(const PerceptronJob<T>& job, int64_t first, int lanes, const T* to_x,
+                             T* unused) {
+  const Squares<T>& q = *job.squares;
+  T* to[P::W];
+  for (int lane = 0; lane < lanes; ++lane) {
+    const int64_t i = first + lane;
+    to[lane] = !q.first     ? job.to_x + i * job.x_stride
+               : i % q.rows ? job.to_x + (i - 1) * job.x_stride
+                            : unused;
+  }
+  units_to_lanes(to_x, job.shape->sizes[0], lanes, P::W, to);
+}
+
 static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratch) {
   using P = Many<2>;
   const Perceptron& shape = *job.shape;
@@ -83,6 +126,7 @@ static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratc
   T* to_x = z + int64_t(wide) * P::W;
   T* xt = to_x + int64_t(wide) * P::W;
   T* own = xt + int64_t(PAIRS_AT_ONCE) * P::W * wide;
+  T* tapes = own + int64_t(PERCEPTRON_GROUP) * gradients * P::W;
   T* sums = job.sums + slot * p.sums;
   zero(sums, p.sums);
   Pairs pairs;
@@ -91,14 +135,21 @@ static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratc
   const int64_t begin = blocks * slot / job.slots, end = blocks * (slot + 1) / job.slots;
   for (int64_t block = begin; block < end; ++block) {
     const int64_t first = block * P::W;
-    T* to_layers = own + ((block - begin) % PERCEPTRON_GROUP) * int64_t(gradients) * P::W;
+    const int64_t place = (block - begin) % PERCEPTRON_GROUP;
+    T* to_layers = own + place * int64_t(gradients) * P::W;
     T* to_out = to_layers + int64_t(gradients - n_out) * P::W;
     const int lanes = job.n - first < P::W ? int(job.n - first) : P::W;
-    take_rows<P>(job.to_y + first * n_out, n_out, n_out, lanes, to_out);
-    const T* tape = job.tape + block * row_size;
+    T* tape = job.squares ? tapes + place * row_size : job.tape + block * row_size;
+    if (job.squares)
+      squares_forward<P>(job, c, kept, first, lanes, tape, to_x, z, to_out);
+    else
+      take_rows<P>(job.to_y + first * n_out, n_out, n_out, lanes, to_out);
     evaluate_backward<P>(k, shape, M_FIELD, kept, tape, tape + int64_t(in) * P::W, to_layers, to_x);
-    if (job.to_x) give_rows<P>(to_x, in, lanes, job.to_x + first * in, in);
-    if ((block - begin) % PERCEPTRON_GROUP == PERCEPTRON_GROUP - 1 || block + 1 == end)
+    if (job.squares)
+      squares_backward<P>(job, first, lanes, to_x, z);
+    else if (job.to_x)
+      give_rows<P>(to_x, in, lanes, job.to_x + first * in, in);
+    if (place == PERCEPTRON_GROUP - 1 || block + 1 == end)
       flush(p, pairs, P::W, P::W, sums, xt);
   }
 }

@@ -70,14 +70,20 @@ def unsupported(model: BaseModel, examples: object, recipe: Recipe) -> str | Non
 class DirectStep:
     """Losses and gradients of batches, in buffers that stay.
 
+    Where the loss is the mean squared error of all rows but the first, its gradient follows from
+    the prediction: one call decodes some states, and is back at their gradients while what it
+    needs is in the cache.
+
     Args:
         model: for which `unsupported` is None.
         examples: of the epoch.
         state: its parameters and their gradients.
+        scale: of the loss whose gradient is wanted.
     """
 
-    def __init__(self, model: Model, examples: Examples, state: RunState) -> None:
+    def __init__(self, model: Model, examples: Examples, state: RunState, scale: float) -> None:
         self.model, self.examples, self.parameters = model, examples, state.parameters
+        self._scale = scale
         self.asked = _asked(model)
         choice = choose(model.spec, model.dtype, model.device)
         self._optimizer = CompiledAdamax(state.optimizer, state.parameters.flat, choice.variant)
@@ -90,8 +96,9 @@ class DirectStep:
             self._decoder = _Decoder(sizes, choice.variant)
             self._decoder_weights = _Packed([t for layer in layers for t in layer], self.parameters)
         self._shifted = model.config.readout == "last_row"
-        # Buffers: the first state, the states that are decoded, and gradients of states.
-        self._first = self._read = self._to_read = self._to_after = torch.empty(0)
+        self._first = self._to_states = torch.empty(0)
+        self._squares: tuple[Tensor, Tensor] | None = None
+        self._targets: Tensor | None = None
 
     def loss(self, index: Tensor) -> float:
         """The loss of some trajectories; `backward` continues from it.
@@ -101,20 +108,32 @@ class DirectStep:
         """
         rows = self.examples.prepared.take(index)
         shape = (len(rows), rows.rows, self.model.spec.state_size)
-        if self._read.shape != shape:
+        if self._to_states.shape != shape:
             self._first = self.model.first_state(len(rows)).detach().contiguous()
-            self._read = self._first.new_zeros(shape)
-            self._to_read, self._to_after = (
-                torch.zeros_like(self._read),
-                torch.zeros_like(self._read),
-            )
+            # Zeros but where the prediction is read from.
+            self._to_states = self._first.new_zeros(shape)
         if self.model.start is not None:
             self._first[:, : self.model.channels] = self.model.start.detach()
         before, after = self._scan.forward(self._weights.gather(), rows, self._first)
+        examples = self.examples
+        self._targets = self._squares = None
+        if examples.counted is None and examples.typical is None and rows.rows > 1:
+            self._targets = examples.targets.index_select(0, index)[:, : rows.rows - 1]
+            if self._decoder is not None and _has_squares():
+                self._squares = self._decoder.squares(
+                    self._decoder_weights.gather(),
+                    after if self._shifted else before,
+                    self._first if self._shifted else None,
+                    self.model.head.anchors,
+                    examples.targets,
+                    index,
+                    self._scale,
+                    self._to_states,
+                )
+                return float(mse_loss(self._squares[0][:, 1:], self._targets))
         read = before
         if self._shifted:
-            read = self._read
-            read[:, 0], read[:, 1:] = self._first, after[:, :-1]
+            read = torch.cat([self._first[:, None], after[:, :-1]], 1)
         return self._loss_of(self._decode(read), index)
 
     def _decode(self, read: Tensor) -> Tensor:
@@ -126,39 +145,47 @@ class DirectStep:
         return mean.view(*read.shape[:2], -1)
 
     def _loss_of(self, mean: Tensor, index: Tensor) -> float:
-        examples, rows = self.examples, mean.shape[1]
-        self._mean, self._targets = mean, None
-        if examples.counted is None and examples.typical is None and rows > 1:
-            self._targets = examples.targets.index_select(0, index)[:, : rows - 1]
+        self._mean = mean
+        if self._targets is not None:
             return float(mse_loss(mean[:, 1:], self._targets))
         mean.requires_grad_()
         with torch.enable_grad():
-            self._graph = examples.loss_of(self.model, Prediction(mean), index)
+            self._graph = self.examples.loss_of(self.model, Prediction(mean), index)
         return float(self._graph.detach())
 
-    def _gradient(self, scale: float) -> Tensor:
+    def _gradient(self) -> Tensor:
         """(batch, rows, channels) of the loss with respect to the prediction."""
         if self._targets is None:
-            (self._graph * scale).backward()  # type: ignore[no-untyped-call]
+            (self._graph * self._scale).backward()  # type: ignore[no-untyped-call]
             assert self._mean.grad is not None
             return self._mean.grad
         found = torch.empty_like(self._mean)
         found[:, 0] = 0
-        factor = self._mean.new_tensor(scale)
+        factor = self._mean.new_tensor(self._scale)
         torch.ops.aten.mse_loss_backward.grad_input(
             factor, self._mean[:, 1:], self._targets, _MEAN, grad_input=found[:, 1:]
         )
         return found
 
-    def backward(self, scale: float) -> None:
-        """Sets the gradients of the parameters to those of the newest loss times a scale.
-
-        Args:
-            scale: of the loss.
-        """
-        to_mean = self._gradient(scale)
+    def backward(self) -> None:
+        """Sets the gradients of the parameters to those of the newest loss."""
         self.parameters.zero_gradient()
-        head, spec = self.model.head, self.model.spec
+        if self._squares is None:
+            to_states = self._through_head(self._gradient())
+        else:
+            self._decoder_weights.add(self._squares[1])
+            to_states = self._to_states
+        to_packed, to_first = self._scan.backward(
+            *((None, to_states) if self._shifted else (to_states, None))
+        )
+        self._weights.add(to_packed)
+        if self.model.start is not None:
+            assert self.model.start.grad is not None
+            self.model.start.grad.add_(to_first.sum(0)[: self.model.channels])
+
+    def _through_head(self, to_mean: Tensor) -> Tensor:
+        """(batch, rows, state_size) gradient of the states from that of the prediction."""
+        head = self.model.head
         if self._decoder is None:
             to_x, at = to_mean * head.std, slice(0, self.model.channels)
         else:
@@ -166,18 +193,13 @@ class DirectStep:
             self._decoder_weights.add(to_packed)
             at = slice(head.anchors, head.anchors + head.hidden_size)
         to_read = to_x.view(*to_mean.shape[:2], -1)
-        if to_read.shape[2] != spec.state_size:
-            self._to_read[..., at] = to_read
-            to_read = self._to_read
         if self._shifted:
-            self._to_after[:, :-1] = to_read[:, 1:]
-            to_packed, to_first = self._scan.backward(None, self._to_after)
+            self._to_states[:, :-1, at] = to_read[:, 1:]
+        elif to_read.shape[2] == self._to_states.shape[2]:
+            return to_read
         else:
-            to_packed, to_first = self._scan.backward(to_read, None)
-        self._weights.add(to_packed)
-        if self.model.start is not None:
-            assert self.model.start.grad is not None
-            self.model.start.grad.add_(to_first.sum(0)[: self.model.channels])
+            self._to_states[..., at] = to_read
+        return self._to_states
 
     def descend(self) -> None:
         """Takes the step of the optimizer."""
@@ -289,6 +311,53 @@ class _Decoder:
         )
         return y
 
+    def squares(
+        self,
+        packed: Tensor,
+        states: Tensor,
+        first: Tensor | None,
+        column: int,
+        targets: Tensor,
+        index: Tensor,
+        scale: float,
+        to_states: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Predictions, and gradients of their mean squared error.
+
+        Args:
+            packed: weights.
+            states: (batch, rows, state_size).
+            first: (batch, state_size) the state that row 0 is read from, and row i from that of
+                row i - 1; None: each row is read from its own.
+            column: of the first input in a state.
+            targets: (trajectories, rows - 1 or more, outputs) of the rows after the first.
+            index: (batch,) of trajectories.
+            scale: of the gradients.
+            to_states: (batch, rows, state_size); set where the inputs are.
+
+        Returns:
+            (batch, rows, outputs) predictions, and the gradient of the weights.
+        """
+        y = states.new_empty((*states.shape[:2], self._outputs))
+        to_packed = torch.empty_like(packed)
+        cpu.compiled.perceptron_squares(
+            self._own,
+            self._variant,
+            packed.numpy(),
+            states.numpy(),
+            None if first is None else first.numpy(),
+            column,
+            targets.numpy(),
+            index.numpy(),
+            2.0 / (len(index) * (states.shape[1] - 1) * self._outputs),
+            scale,
+            y.numpy(),
+            to_packed.numpy(),
+            to_states.numpy(),
+            cpu.threads(),
+        )
+        return y, to_packed
+
     def backward(self, to_y: Tensor) -> tuple[Tensor, Tensor]:
         to_packed, to_x = torch.empty_like(self._packed), torch.empty_like(self._x)
         cpu.compiled.perceptron_backward(
@@ -303,6 +372,11 @@ class _Decoder:
             cpu.threads(),
         )
         return to_packed, to_x
+
+
+def _has_squares() -> bool:
+    """Whether the compiled module is not of an earlier version."""
+    return hasattr(cpu.compiled, "perceptron_squares")
 
 
 def direct_step(
@@ -322,7 +396,7 @@ def direct_step(
         if unsupported(model, examples, recipe) is None:
             assert isinstance(model, Model)
             assert isinstance(examples, Examples)
-            made = DirectStep(model, examples, state)
+            made = DirectStep(model, examples, state, recipe.loss_scale)
         known = state.direct = (model, examples, made)
     step: DirectStep | None = known[2]
     return step if step is not None and _asked(step.model) == step.asked else None

@@ -432,7 +432,7 @@ def train_step(
         value = direct.loss(index)
         _check_loss(value, state.epoch, state.step)
         _set_rate(state, recipe, total)
-        direct.backward(recipe.loss_scale)
+        direct.backward()
         _clip(state, recipe)
         direct.descend()
         return value
