@@ -12,7 +12,7 @@ import yaml
 import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.config import SplitConfig
-from offbeat.data import memory
+from offbeat.data import converted, memory
 from offbeat.data.masking import masked_values
 from offbeat.data.shards import ShardedDataset, save_shards
 from offbeat.errors import FileFormatError, InputError
@@ -107,12 +107,38 @@ def test_parts_are_whole_files_and_samples_are_masked(folder):
         learn_shards(opened.take(range(4)), split=SplitConfig(fractions=(0.1, 0.45, 0.45)))
 
 
+def test_logs_of_other_programs_are_converted_one_by_one(tmp_path, capsys, monkeypatch):
+    logs, out = tmp_path / "logs", tmp_path / "run"
+    logs.mkdir()
+    data = ob.simulate("hopper", 8, 60, seed=1, progress=False)
+    for i, one in enumerate(data):
+        ob.save(ob.Dataset((one,)), logs / f"{i}.csv")
+    command = ["train", str(logs), str(out), "--lazy", *SMALL, "--split.window=20"]
+    assert main(command) == 0
+    assert "8 files, 480 rows x 14 channels" in capsys.readouterr().err
+    opened = ob.Dataset.open(out / "converted")
+    assert [shard.rows for shard in opened.shards] == [(60,)] * 8
+    assert np.allclose(opened.part(3)[0].values, data[3].values)
+    assert main(["impute", str(out), str(logs / "3.csv"), str(tmp_path / "filled.csv")]) == 0
+
+    # Files that did not change are not read again; one that did is.
+    read_again = []
+    monkeypatch.setattr(converted, "read", lambda path, **_: read_again.append(path) or data)
+    converted.convert(logs, out / "converted", outliers="mask")
+    assert read_again == []
+    ob.save(ob.Dataset((data[0],)), logs / "5.csv")
+    converted.convert(logs, out / "converted", outliers="mask")
+    assert read_again == [logs / "5.csv"]
+
+
 def test_what_is_not_read_file_by_file_is_one_line(folder, tmp_path, capsys):
     out = tmp_path / "run"
     file = next(folder.glob("*.parquet"))
-    assert "--lazy reads a folder of Parquet files" in error_of(
+    assert "--lazy reads the files of a folder one by one" in error_of(
         capsys, "train", file, out, "--lazy"
     )
+    (tmp_path / "none").mkdir()
+    assert "holds no files" in error_of(capsys, "train", tmp_path / "none", out, "--lazy")
     options = ["train", folder, out, "--lazy", "--two_sided"]
     assert "--two_sided needs the data in memory" in error_of(capsys, *options)
 

@@ -212,6 +212,9 @@ _FIELDS = (
 LOCK = ".lock"
 """File in a run's folder with the id of the process that trains there."""
 
+CONVERTED = "converted"
+"""Folder of a run with its logs as data sets, where they are read one by one."""
+
 LADDER = "ladder"
 """Subfolder of the trainings from which `fit_ladder` chooses."""
 
@@ -408,7 +411,7 @@ def resume_run(folder: Path, model: BaseModel, state: RunState, identity: dict[s
     checkpoints = sorted((folder / "checkpoints").glob("steps-*"))
     if not checkpoints:
         others = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if others - {"tensorboard", "checkpoints", LOCK, LADDER}:
+        if others - {"tensorboard", "checkpoints", LOCK, LADDER, CONVERTED}:
             raise InputError(
                 f"{folder} is not empty and holds no run ({', '.join(sorted(others)[:3])}, ...); "
                 "give a new folder"

@@ -13,7 +13,7 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from typing import Any
 
@@ -156,7 +156,8 @@ def run_commands(
         command = names[parsed.subcommand]
         options = parser.instantiate(parsed)[parsed.subcommand].as_dict()
         options.pop("config", None)
-        with _said(quiet=options.pop("quiet"), verbose=options.pop("verbose")):
+        spoken = parsers[command].spoken
+        with _said(spoken, quiet=options.pop("quiet"), verbose=options.pop("verbose")):
             commands[command](**options)
     except ArgumentError as error:
         return _fail(str(error), 2)
@@ -178,18 +179,35 @@ def run_commands(
     return 0
 
 
+class _Notes(logging.Handler):
+    """Prints the warnings of the library in the words of the command line."""
+
+    def __init__(self, spoken: Callable[[str], str]) -> None:
+        super().__init__(logging.WARNING)
+        self.spoken = spoken
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one line."""
+        print(f"offbeat: {self.spoken(record.getMessage())}", file=sys.stderr)
+
+
 @contextmanager
-def _said(*, quiet: bool, verbose: bool) -> Iterator[None]:
+def _said(spoken: Callable[[str], str], *, quiet: bool, verbose: bool) -> Iterator[None]:
     """Standard error without notes and bars, or with the time and the place of an error."""
     if quiet:
         with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stderr(nowhere):
             yield
         return
+    logger = logging.getLogger("offbeat")
+    handler: logging.Handler = _Notes(spoken)
     if not verbose:
-        yield
+        logger.addHandler(handler)
+        try:
+            yield
+        finally:
+            logger.removeHandler(handler)
         return
-    began = time.monotonic()
-    logger, handler = logging.getLogger("offbeat"), logging.StreamHandler()
+    began, handler = time.monotonic(), logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
     level = logger.level
     logger.addHandler(handler)

@@ -71,8 +71,9 @@ def train_command(
         budget_minutes: about how long training may take in all, in minutes, where no model is
             named.
         reader: options of reading the log; the run keeps them for the other commands.
-        lazy: read the files of a folder of data sets of Offbeat when they are needed, and never
-            all at once; by default where they need more than a quarter of the available memory.
+        lazy: read the files of a folder when they are needed, and never all at once; logs of other
+            formats are first converted one by one into its folder converted. By default
+            where data sets of Offbeat need more than a quarter of the available memory.
         seed: seed of the initial weights and of the order of training.
         threads: threads of PyTorch; one is fastest for models of this size.
         device: device that trains the model: cpu, cuda, cuda:1, or auto, which takes a GPU where
@@ -112,7 +113,7 @@ def train_command(
     torch.set_num_threads(threads)
     open_split = split == SplitConfig(seed=split.seed)
     given_split = None if open_split else split
-    opened = _opened_lazily(data, lazy, two_sided)
+    opened = _opened_lazily(data, lazy, two_sided, reader, out)
     chosen = dataset = None
     if opened is None:
         with busy("reading and inspecting the log"):
@@ -177,8 +178,9 @@ def train_command(
             save(learned.test, out / TEST_FILE)
         else:
             save_split(out / "split.json", learned.split, dataset)
-        if dataset is not None and (reader or "found" in dataset.meta):
-            kept = {**(reader or {}), FOUND: dataset.meta.get("found", {})}
+        meta = opened.meta if opened is not None else dataset.meta if dataset is not None else {}
+        if reader or "found" in meta:
+            kept = {**(reader or {}), FOUND: meta.get("found", {})}
             write_json(out / READER_FILE, kept)
         with busy("scoring the test part"):
             scores, text = scored(blend, learned.test, evaluate(made, learned.test))
@@ -190,28 +192,40 @@ def train_command(
         say(result, f"{heading}\n{text}", json)
 
 
-def _opened_lazily(data: Path, lazy: bool | None, two_sided: bool | None) -> ShardedDataset | None:
+def _opened_lazily(
+    data: Path,
+    lazy: bool | None,
+    two_sided: bool | None,
+    reader: dict[str, Any] | None,
+    out: Path,
+) -> ShardedDataset | None:
     """The folder, if its files are to be read when they are needed; None if all at once.
 
+    With `lazy`, logs that are no data sets of Offbeat are converted into the folder `converted` of
+    the run, one by one.
+
     Raises:
-        InputError: the former is asked for, and the data is no folder of data sets of Offbeat; or
-            it is so, and a model of reversed trajectories is asked for.
+        InputError: the former is asked for, and the data is no folder; or it is so, and a model of
+            reversed trajectories is asked for.
     """
+    from offbeat.data.converted import convert
     from offbeat.data.memory import available_memory, gigabytes
     from offbeat.data.shards import ShardedDataset
     from offbeat.data.store import holds_data_set
+    from offbeat.run import CONVERTED
 
     first = next(iter(sorted(data.glob("*.parquet"))), None) if data.is_dir() else None
-    if first is None or not holds_data_set(first):
-        if lazy:
-            raise InputError(
-                "--lazy reads a folder of Parquet files that offbeat.save or save_shards wrote, "
-                f"got {data}; write one from any logs with offbeat.data.shards.save_shards"
-            )
+    ours = first is not None and holds_data_set(first)
+    if lazy and not data.is_dir():
+        raise InputError(f"--lazy reads the files of a folder one by one, got {data}")
+    if lazy is False or (not ours and not lazy):
         return None
-    if lazy is False:
-        return None
-    opened, free = ShardedDataset.open(data), available_memory()
+    if ours:
+        opened = ShardedDataset.open(data)
+    else:
+        with busy(f"converting the files of {data} to {out / CONVERTED}"):
+            opened = convert(data, out / CONVERTED, **{"outliers": "mask", **(reader or {})})
+    free = available_memory()
     if not lazy and (free is None or opened.bytes <= LARGE * free):
         return None
     if two_sided:

@@ -199,7 +199,7 @@ def read(
         return _read_several(stated, stated[0].parent, format, files, options)
     path = require_source(path)
     if path.is_dir():
-        inside = _files_of(path, format)
+        inside = files_of(path, format)
         if inside:
             return _read_several(inside, path, format, files, options, stated=False)
     reader = reader_of(path) if format is None else READERS[format]
@@ -262,8 +262,13 @@ def _read_several(
     return _assembled(recordings, folder, reader, cleaning)
 
 
-def _files_of(folder: Path, format: str | None) -> list[Path]:
-    """The files in a folder that no reader knows as a whole; empty if one does."""
+def files_of(folder: Path, format: str | None) -> list[Path]:
+    """The files in a folder that no reader knows as a whole; empty if one does.
+
+    Args:
+        folder: the folder.
+        format: name of the reader; by default any.
+    """
     of_folders = [reader for reader in READERS.values() if FOLDER in reader.suffixes]
     if format is not None:
         reader = READERS[format]
@@ -387,7 +392,7 @@ def reader_of(path: Path) -> Reader:
         if reader.recognises is not None and reader.recognises(path):
             return reader
     if suffix == FOLDER:
-        inside = _files_of(path, None)
+        inside = files_of(path, None)
         if inside:
             return reader_of(inside[0])
         known = ", ".join(reader.name for reader in fitting) or "none"
