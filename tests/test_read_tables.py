@@ -224,6 +224,13 @@ class TestTimesOfIso8601:
         assert mixed[0].units == ("", "deg", "")
         assert "'hip' has several units in column 'unit' (deg, rad)" in str(mixed.meta["cleaning"])
 
+    def test_of_answers_are_no_channels(self, text_file):
+        header = "trajectory,time,clock_ns,x,x|observed,x|low,x|high"
+        rows = "0,0,17,1,true,1,1\n0,0.5,18,2,false,1,3\n"
+        assert read(text_file(f"{header}\n{rows}"))[0].names == ("x",)
+        wide = read(text_file("time,clock_ns,x\n0,17,1\n0.01,18,2\n"), channels=["clock_ns", "x"])
+        assert wide[0].names == ("clock_ns", "x")
+
     @pytest.mark.parametrize(
         ("first", "second", "message"),
         [

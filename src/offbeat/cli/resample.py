@@ -65,8 +65,9 @@ def resample_command(
         "values": total,
         "filled_by": by,
     }
+    episodes = "trajectory" if len(even) == 1 else "trajectories"
     text = (
-        f"{out}: {name}, {len(even)} trajectories, {rows} rows at {rate_hz:g} Hz; {filled} of "
+        f"{out}: {name}, {len(even)} {episodes}, {rows} rows at {rate_hz:g} Hz; {filled} of "
         f"{total} values have no measurement within half a period and are filled ({by})"
     )
     say(result, text, json)

@@ -7,6 +7,7 @@ channel, value), and holds one recording or, by a column of labels, several.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -172,7 +173,8 @@ class Columns:
             kept = [column for column in columns if column not in gone]
             if beside:
                 notes = (
-                    "masks and intervals of answers are left out unless chosen with channels=",
+                    "masks, intervals and the clock of answers are left out unless chosen with "
+                    "channels=",
                 )
             if stamps:
                 notes = (
@@ -235,7 +237,8 @@ def _of_answers(columns: Sequence[str]) -> set[str]:
     """The columns that Offbeat writes beside those of filled channels, such as `knee|observed`."""
     known = set(columns)
     parts = {column: column.rpartition("|") for column in columns}
-    return {c for c, (name, _, what) in parts.items() if name in known and what in _BESIDE}
+    found = {c for c, (name, _, what) in parts.items() if name in known and what in _BESIDE}
+    return found | {c for c in columns if found and re.fullmatch("clock_[a-z]+", c)}
 
 
 def unit_written(header: Sequence[str], time: str) -> str | None:
