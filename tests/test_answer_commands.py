@@ -221,7 +221,7 @@ def test_a_figure_shows_observed_values_masked_truth_and_every_answer():
     figure = answers(truth, {"two_sided": filled, "my_fill": filled}, ["a"])
     (axes,) = figure.axes
     drawn = {line.get_label(): line for line in axes.get_lines()}
-    assert set(drawn) == {"Model, two-sided", "my_fill", "Masked truth", "Observed"}
+    assert set(drawn) == {"Filled from both sides", "my_fill", "Masked truth", "Observed"}
     assert drawn["Masked truth"].get_xydata().tolist() == [[2, 4], [3, 9]]
     assert drawn["Observed"].get_xdata().tolist() == [0, 1, 4, 5]
     line = drawn["my_fill"].get_ydata()
