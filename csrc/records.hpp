@@ -99,9 +99,9 @@ struct Job {
   int group = 4;                 // rows whose weight gradients are added together
 };
 
-// The squared errors of a perceptron at the states of trajectories, which are its rows one after the
-// other: the output at row i of a trajectory is compared with target i - 1, and that at row 0 with
-// nothing.
+// The squared errors of a perceptron at the states of trajectories, which are its rows one after
+// the other: the output at row i of a trajectory is compared with target i - 1, and that at row 0
+// with nothing.
 template <class T>
 struct Squares {
   const T* first = nullptr;  // (trajectories, stride of x): row i is read at i - 1, row 0 here
@@ -109,7 +109,8 @@ struct Squares {
   const T* targets = nullptr;
   const int64_t* index = nullptr;  // where the targets of each trajectory lie
   int64_t by_trajectory = 0, by_row = 0;
-  T norm = 0, scale = 0;  // of the gradient of a squared error
+  T norm = 0, scale = 0;    // of the gradient of a squared error
+  T* squares = nullptr;     // (trajectories, rows - 1, out) of the errors
 };
 
 // A perceptron applied to many rows.
@@ -125,7 +126,7 @@ struct PerceptronJob {
   T* tape = nullptr;
   T* sums = nullptr;
   int slots = 0;
-  const Squares<T>* squares = nullptr;  // then y is computed, and its gradient from the squares
+  const Squares<T>* squares = nullptr;  // then the gradient of y comes from its squared error
 };
 
 // One row of one trajectory, in buffers that the stream owns.

@@ -707,20 +707,46 @@ def test_states_and_slots_that_are_not_there_are_refused() -> None:
         ({"first": (2, 4)}, "first has shape"),
         ({"states": (2, 1, 5)}, "the number of rows is 1, expected 2 to"),
         ({"to_states": (2, 4, 3)}, "to_states has shape"),
-        ({"y": (2, 3, 2)}, "y has shape"),
+        ({"squares": (2, 4, 2)}, "squares has shape"),
     ],
 )
 def test_squares_refuse_what_does_not_fit(name: str, change: dict[str, Any], message: str) -> None:
     shape = compiled.Perceptron([3, 2], 0)
     given: dict[str, Any] = {
         "weights": (8,), "states": (2, 4, 5), "first": (2, 5), "column": 2, "targets": (5, 3, 2),
-        "index": np.array([4, 0]), "norm": 1.0, "scale": 1.0, "y": (2, 4, 2), "to_weights": (8,),
-        "to_states": (2, 4, 5),
+        "index": np.array([4, 0]), "norm": 1.0, "scale": 1.0, "squares": (2, 3, 2),
+        "to_weights": (8,), "to_states": (2, 4, 5),
     }  # fmt: skip
 
     def call(**given: Any) -> None:
         made = {k: np.ones(v, np.float32) if isinstance(v, tuple) else v for k, v in given.items()}
         compiled.perceptron_squares(shape, name, **made, threads=1)
+
+    call(**given)
+    with pytest.raises(ob.InputError, match=message):
+        call(**given | change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"index": np.array([0, 5])}, "an entry of index is 5, expected 0 to 4"),
+        ({"targets": (5, 2, 2)}, "rows of the targets is 2, expected 3 to"),
+        ({"unit": (3,)}, "unit has shape"),
+        ({"squares": (2, 3, 6)}, "number of outputs is 6, expected 0 to 5"),
+        ({"to_states": (2, 4, 3)}, "to_states has shape"),
+    ],
+)
+def test_squares_of_states_refuse_what_does_not_fit(change: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {
+        "states": (2, 4, 5), "unit": (2,), "zero": (2,), "targets": (5, 3, 2),
+        "index": np.array([4, 0]), "norm": 1.0, "scale": 1.0, "squares": (2, 3, 2),
+        "to_states": (2, 4, 5),
+    }  # fmt: skip
+
+    def call(**given: Any) -> None:
+        made = {k: np.ones(v, np.float32) if isinstance(v, tuple) else v for k, v in given.items()}
+        compiled.state_squares(**made)
 
     call(**given)
     with pytest.raises(ob.InputError, match=message):

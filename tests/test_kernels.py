@@ -371,15 +371,15 @@ def test_squares_of_a_perceptron_have_the_gradients_of_autograd(
     trained = [t for layer in layers for t in layer]
     expected = torch.autograd.grad(2.5 * loss, [states, *trained])
     packed = torch.cat([t.detach().reshape(-1) for t in trained])
-    y, to_packed = torch.empty_like(x), torch.empty_like(packed)
+    squares, to_packed = torch.empty(batch, rows - 1, 3).double(), torch.empty_like(packed)
     to_states = torch.zeros_like(states)
     cpu.compiled.perceptron_squares(
         cpu.compiled_perceptron(sizes, activation), name, packed.numpy(),
         states.detach().numpy(), start.detach().contiguous().numpy() if shifted else None, column,
-        targets.numpy(), index.numpy(), 2 / x[:, 1:].numel(), 2.5, y.detach().numpy(),
+        targets.numpy(), index.numpy(), 2 / x[:, 1:].numel(), 2.5, squares.numpy(),
         to_packed.numpy(), to_states.numpy(), 2,
     )  # fmt: skip
-    torch.testing.assert_close(y, x, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(squares.mean(), loss, rtol=1e-12, atol=0)
     torch.testing.assert_close(to_states, expected[0], rtol=1e-12, atol=1e-14)
     gradient = torch.cat([g.reshape(-1) for g in expected[1:]])
     torch.testing.assert_close(to_packed, gradient, rtol=1e-12, atol=1e-14)

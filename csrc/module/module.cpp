@@ -177,15 +177,25 @@ void bind(nb::module_& m, const char* suffix) {
       "perceptron_squares",
       [](const Perceptron& p, const std::string& set, Const<T> weights, Const<T> states,
          Maybe<T> first, int64_t column, Const<T> targets, Const<int64_t> index, double norm,
-         double scale, Array<T> y, Array<T> to_weights, Array<T> to_states, int threads) {
+         double scale, Array<T> squares, Array<T> to_weights, Array<T> to_states,
+         int threads) {
         perceptron_squares<T>(p, find_instruction_set(set), weights, states, first, column, targets,
-                              index, norm, scale, y, to_weights, to_states, threads);
+                              index, norm, scale, squares, to_weights, to_states, threads);
       },
       nb::arg("shape"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
       nb::arg("states").noconvert(), nb::arg("first").noconvert().none(), nb::arg("column"),
       nb::arg("targets").noconvert(), nb::arg("index").noconvert(), nb::arg("norm"),
-      nb::arg("scale"), nb::arg("y").noconvert(), nb::arg("to_weights").noconvert(),
+      nb::arg("scale"), nb::arg("squares").noconvert(), nb::arg("to_weights").noconvert(),
       nb::arg("to_states").noconvert(), nb::arg("threads"));
+  m.def(
+      "state_squares",
+      [](Const<T> states, Const<T> unit, Const<T> zero, Const<T> targets, Const<int64_t> index,
+         double norm, double scale, Array<T> squares, Array<T> to_states) {
+        state_squares<T>(states, unit, zero, targets, index, norm, scale, squares, to_states);
+      },
+      nb::arg("states").noconvert(), nb::arg("unit").noconvert(), nb::arg("zero").noconvert(),
+      nb::arg("targets").noconvert(), nb::arg("index").noconvert(), nb::arg("norm"),
+      nb::arg("scale"), nb::arg("squares").noconvert(), nb::arg("to_states").noconvert());
   m.def(
       "adamax",
       [](const std::string& set, Const<T> gradient, double lerp, double beta, double eps,

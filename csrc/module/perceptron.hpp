@@ -87,49 +87,94 @@ void perceptron_backward(const Perceptron& shape, const InstructionSet& set,
   perceptron_gradients<T>(job, kernels, weights.data(), flat, threads);
 }
 
-// Outputs at the states of trajectories, and gradients of their squared errors (records.hpp).
+// The targets of the rows after the first of some trajectories.
 template <class T>
-void perceptron_squares(const Perceptron& shape, const InstructionSet& set, const Const<T>& weights,
-                        const Const<T>& states, const Maybe<T>& first, int64_t column,
-                        const Const<T>& targets, const Const<int64_t>& index, double norm,
-                        double scale, Array<T> y, Array<T> to_weights, Array<T> to_states,
-                        int threads) {
-  if (states.ndim() != 3)
-    refuse("states has shape " + shape_of(states) + ", expected (trajectories, rows, units)");
-  const int64_t batch = int64_t(states.shape(0)), rows = int64_t(states.shape(1));
-  const int64_t width = int64_t(states.shape(2)), out = shape.sizes[shape.layers];
+void check_targets(const Const<T>& targets, const Const<int64_t>& index, int64_t batch,
+                   int64_t rows, int64_t out) {
   in_range("the number of trajectories", batch, 1, MAX_COUNT);
   in_range("the number of rows", rows, 2, MAX_COUNT / batch);
-  in_range("the first column of the inputs", column, 0, width - shape.sizes[0]);
-  check_shape("weights", weights, {perceptron_flat(shape)});
-  check_shape("to_weights", to_weights, {perceptron_flat(shape)});
-  check_contiguous("states", states);
-  check_shape("to_states", to_states, {batch, rows, width});
-  check_contiguous("to_states", to_states);
-  check_shape("y", y, {batch, rows, out});
-  check_contiguous("y", y);
-  if (first) {
-    check_shape("first", *first, {batch, width});
-    check_contiguous("first", *first);
-  }
   if (targets.ndim() != 3) refuse("targets has shape " + shape_of(targets) + ", expected 3 axes");
   check_shape("targets", targets, {int64_t(targets.shape(0)), int64_t(targets.shape(1)), out});
   in_range("the number of rows of the targets", int64_t(targets.shape(1)), rows - 1, MAX_COUNT);
   check_shape("index", index, {batch});
   for (int64_t i = 0; i < batch; ++i)
     in_range("an entry of index", index.data()[i], 0, int64_t(targets.shape(0)) - 1);
+}
+
+// Squared errors of the outputs at the states of trajectories, and their gradients (records.hpp).
+template <class T>
+void perceptron_squares(const Perceptron& shape, const InstructionSet& set, const Const<T>& weights,
+                        const Const<T>& states, const Maybe<T>& first, int64_t column,
+                        const Const<T>& targets, const Const<int64_t>& index, double norm,
+                        double scale, Array<T> errors, Array<T> to_weights, Array<T> to_states,
+                        int threads) {
+  if (states.ndim() != 3)
+    refuse("states has shape " + shape_of(states) + ", expected (trajectories, rows, units)");
+  const int64_t batch = int64_t(states.shape(0)), rows = int64_t(states.shape(1));
+  const int64_t width = int64_t(states.shape(2)), out = shape.sizes[shape.layers];
+  check_targets<T>(targets, index, batch, rows, out);
+  in_range("the first column of the inputs", column, 0, width - shape.sizes[0]);
+  check_shape("weights", weights, {perceptron_flat(shape)});
+  check_shape("to_weights", to_weights, {perceptron_flat(shape)});
+  check_contiguous("states", states);
+  check_shape("to_states", to_states, {batch, rows, width});
+  check_contiguous("to_states", to_states);
+  check_shape("squares", errors, {batch, rows - 1, out});
+  check_contiguous("squares", errors);
+  if (first) {
+    check_shape("first", *first, {batch, width});
+    check_contiguous("first", *first);
+  }
   Squares<T> squares;
   squares.first = first ? first->data() + column : nullptr, squares.rows = rows;
   squares.targets = targets.data(), squares.index = index.data();
   squares.by_trajectory = targets.stride(0), squares.by_row = targets.stride(1);
-  squares.norm = T(norm), squares.scale = T(scale);
+  squares.norm = T(norm), squares.scale = T(scale), squares.squares = errors.data();
   PerceptronJob<T> job;
   job.shape = &shape;
   job.x = states.data() + column, job.x_stride = width, job.n = batch * rows;
   job.to_x = to_states.data() + column;
-  job.y = y.data();
   job.squares = &squares;
   T* flat = to_weights.data();
   nb::gil_scoped_release unlocked;
   perceptron_gradients<T>(job, typed<T>(set), weights.data(), flat, threads);
+}
+
+// The same where the first units of a state are the outputs, apart from their unit and zero.
+template <class T>
+void state_squares(const Const<T>& states, const Const<T>& unit, const Const<T>& zero,
+                   const Const<T>& targets, const Const<int64_t>& index, double norm, double scale,
+                   Array<T> squares, Array<T> to_states) {
+  if (states.ndim() != 3)
+    refuse("states has shape " + shape_of(states) + ", expected (trajectories, rows, units)");
+  const int64_t batch = int64_t(states.shape(0)), rows = int64_t(states.shape(1));
+  const int64_t width = int64_t(states.shape(2));
+  if (squares.ndim() != 3) refuse("squares has shape " + shape_of(squares) + ", expected 3 axes");
+  const int64_t out = in_range("the number of outputs", int64_t(squares.shape(2)), 0, width);
+  check_targets<T>(targets, index, batch, rows, out);
+  check_shape("unit", unit, {out});
+  check_shape("zero", zero, {out});
+  check_contiguous("states", states);
+  check_shape("to_states", to_states, {batch, rows, width});
+  check_contiguous("to_states", to_states);
+  check_shape("squares", squares, {batch, rows - 1, out});
+  check_contiguous("squares", squares);
+  const T *x = states.data(), *by = unit.data(), *from = zero.data();
+  T *to = to_states.data(), *square = squares.data();
+  const T a = T(norm), b = T(scale);
+  nb::gil_scoped_release unlocked;
+  for (int64_t i = 0; i < batch; ++i) {
+    const T* target = targets.data() + index.data()[i] * targets.stride(0);
+    std::fill(to, to + out, T(0));
+    for (int64_t row = 1; row < rows; ++row) {
+      x += width, to += width;
+      for (int64_t c = 0; c < out; ++c) {
+        const T error = (x[c] * by[c] + from[c]) - target[c];
+        square[c] = error * error;
+        to[c] = a * error * b * by[c];
+      }
+      square += out, target += targets.stride(1);
+    }
+    x += width, to += width;
+  }
 }

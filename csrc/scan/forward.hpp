@@ -434,10 +434,26 @@ static NOINLINE void collect(const Job<T>& job, const Block& b, const Grid<T>& g
     if (!add) zero(out, int64_t(units) * P::W);
     return;
   }
-  if (!add) zero(out, int64_t(units) * P::W);
-  for (int lane = 0; lane < b.lanes; ++lane) {
-    const T* in = grid.data + job.order[b.first + lane] * grid.by_lane + row * grid.by_row;
-    for (int u = 0; u < units; ++u) out[int64_t(u) * P::W + lane] += in[u];
+  const T* lanes[P::W];
+  for (int lane = 0; lane < P::W; ++lane)  // lanes that are not in use repeat the first one
+    lanes[lane] =
+        grid.data + job.order[b.first + (lane < b.lanes ? lane : 0)] * grid.by_lane +
+        row * grid.by_row;
+  // A few units at a time, which stay in the inner cache.
+  constexpr int SOME = 16;
+  alignas(64) T found[SOME * P::W];
+  for (int u = 0; u < units; u += SOME) {
+    const int n = units - u < SOME ? units - u : SOME;
+    lanes_to_units(lanes, n, P::W, found);
+    for (int64_t i = 0; i < int64_t(n) * P::W; i += VW) {
+      const int first = int(i % P::W);
+      V x = load<T>(found + i);
+      if (first + VW > b.lanes)
+        for (int r = 0; r < VW; ++r) x[r] = first + r < b.lanes ? x[r] : T(0);
+      T* to = out + int64_t(u) * P::W + i;
+      store<T>(to, (add ? load<T>(to) : splat(0)) + x);
+    }
+    for (const T*& lane : lanes) lane += SOME;
   }
 }
 static void zero(T* p, int64_t n) { __builtin_memset(p, 0, size_t(n) * sizeof(T)); }

@@ -67,7 +67,7 @@ static void perceptron_forward(const PerceptronJob<T>& job, int64_t block, T* sc
   give_rows<P>(out, n_out, lanes, job.y + first * n_out, n_out);
 }
 
-// A block of rows whose errors are squared: their outputs, and the gradient of those.
+// A block of rows whose errors are squared, and the gradient of their outputs.
 template <class P>
 static void squares_forward(const PerceptronJob<T>& job, const Context<P>& c, const Net& kept,
                             int64_t first, int lanes, T* tape, T* z, T* out, T* to_out) {
@@ -88,12 +88,18 @@ static void squares_forward(const PerceptronJob<T>& job, const Context<P>& c, co
   for (int lane = lanes; lane < P::W; ++lane)
     for (int u = 0; u < in; ++u) tape[int64_t(u) * P::W + lane] = 0;
   evaluate<P>(c, shape, M_FIELD, kept, tape, tape + int64_t(in) * P::W, out, z);
-  give_rows<P>(out, n_out, lanes, job.y + first * n_out, n_out);
   lanes_to_units(target, n_out, P::W, to_out);
   P::each(n_out, [&](int64_t i, int lane) {
-    const V to = q.norm * (load<T>(out + i) - load<T>(to_out + i)) * q.scale;
+    const V error = load<T>(out + i) - load<T>(to_out + i), to = q.norm * error * q.scale;
+    store<T>(out + i, error * error);
     store<T>(to_out + i, load<T>(counts + lane) != T(0) ? to : splat(0));
   });
+  T* squares[P::W];
+  for (int lane = 0; lane < lanes; ++lane) {
+    const int64_t i = first + lane, row = i % q.rows;
+    squares[lane] = row ? q.squares + (i - i / q.rows - 1) * n_out : z;  // `z` is not read
+  }
+  units_to_lanes(out, n_out, lanes, P::W, squares);
 }
 // The gradient of their inputs. That of the first state is not needed.
 template <class P>

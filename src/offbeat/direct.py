@@ -118,23 +118,38 @@ class DirectStep:
         examples = self.examples
         self._targets = self._squares = None
         if examples.counted is None and examples.typical is None and rows.rows > 1:
+            if _has_squares() and (self._decoder is not None or not self._shifted):
+                self._squares = self._squared(before, after, index)
+                return float(self._squares[0].mean())
             self._targets = examples.targets.index_select(0, index)[:, : rows.rows - 1]
-            if self._decoder is not None and _has_squares():
-                self._squares = self._decoder.squares(
-                    self._decoder_weights.gather(),
-                    after if self._shifted else before,
-                    self._first if self._shifted else None,
-                    self.model.head.anchors,
-                    examples.targets,
-                    index,
-                    self._scale,
-                    self._to_states,
-                )
-                return float(mse_loss(self._squares[0][:, 1:], self._targets))
         read = before
         if self._shifted:
             read = torch.cat([self._first[:, None], after[:, :-1]], 1)
         return self._loss_of(self._decode(read), index)
+
+    def _squared(self, before: Tensor, after: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Squared errors, and the gradient of the decoder's weights; sets that of the states."""
+        head, targets = self.model.head, self.examples.targets
+        batch, rows, outputs = len(index), before.shape[1], targets.shape[2]
+        squares = before.new_empty((batch, rows - 1, outputs))
+        wanted = (targets.numpy(), index.numpy(), 2.0 / squares.numel(), self._scale)
+        to_states = self._to_states.numpy()
+        if self._decoder is None:
+            cpu.compiled.state_squares(
+                before.numpy(),
+                head.std.numpy(),
+                head.mean.numpy(),
+                *wanted,
+                squares.numpy(),
+                to_states,
+            )
+            return squares, self._first  # there are no weights
+        packed = self._decoder_weights.gather()
+        states, first = (after, self._first) if self._shifted else (before, None)
+        to_packed = self._decoder.squares(
+            packed, states, first, head.anchors, wanted, squares, to_states
+        )
+        return squares, to_packed
 
     def _decode(self, read: Tensor) -> Tensor:
         head = self.model.head
@@ -173,7 +188,8 @@ class DirectStep:
         if self._squares is None:
             to_states = self._through_head(self._gradient())
         else:
-            self._decoder_weights.add(self._squares[1])
+            if self._decoder is not None:
+                self._decoder_weights.add(self._squares[1])
             to_states = self._to_states
         to_packed, to_first = self._scan.backward(
             *((None, to_states) if self._shifted else (to_states, None))
@@ -317,12 +333,11 @@ class _Decoder:
         states: Tensor,
         first: Tensor | None,
         column: int,
-        targets: Tensor,
-        index: Tensor,
-        scale: float,
-        to_states: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Predictions, and gradients of their mean squared error.
+        wanted: tuple[Any, ...],
+        squares: Tensor,
+        to_states: Any,
+    ) -> Tensor:
+        """Squared errors of predictions, and gradients of their mean.
 
         Args:
             packed: weights.
@@ -330,15 +345,14 @@ class _Decoder:
             first: (batch, state_size) the state that row 0 is read from, and row i from that of
                 row i - 1; None: each row is read from its own.
             column: of the first input in a state.
-            targets: (trajectories, rows - 1 or more, outputs) of the rows after the first.
-            index: (batch,) of trajectories.
-            scale: of the gradients.
-            to_states: (batch, rows, state_size); set where the inputs are.
+            wanted: (trajectories, rows - 1 or more, outputs) targets of the rows after the first;
+                (batch,) which trajectories; two factors of the gradients.
+            squares: (batch, rows - 1, outputs) set to the squared errors.
+            to_states: (batch, rows, state_size) set where the inputs are.
 
         Returns:
-            (batch, rows, outputs) predictions, and the gradient of the weights.
+            The gradient of the weights.
         """
-        y = states.new_empty((*states.shape[:2], self._outputs))
         to_packed = torch.empty_like(packed)
         cpu.compiled.perceptron_squares(
             self._own,
@@ -347,16 +361,13 @@ class _Decoder:
             states.numpy(),
             None if first is None else first.numpy(),
             column,
-            targets.numpy(),
-            index.numpy(),
-            2.0 / (len(index) * (states.shape[1] - 1) * self._outputs),
-            scale,
-            y.numpy(),
+            *wanted,
+            squares.numpy(),
             to_packed.numpy(),
-            to_states.numpy(),
+            to_states,
             cpu.threads(),
         )
-        return y, to_packed
+        return to_packed
 
     def backward(self, to_y: Tensor) -> tuple[Tensor, Tensor]:
         to_packed, to_x = torch.empty_like(self._packed), torch.empty_like(self._x)
@@ -376,7 +387,7 @@ class _Decoder:
 
 def _has_squares() -> bool:
     """Whether the compiled module is not of an earlier version."""
-    return hasattr(cpu.compiled, "perceptron_squares")
+    return hasattr(cpu.compiled, "state_squares")
 
 
 def direct_step(
