@@ -106,6 +106,27 @@ def _steps(window: ob.Trajectory) -> np.ndarray:
     return (window.values[rows + 1, 1] - window.values[rows, 1]) ** 2
 
 
+def test_the_table_of_the_walker_is_sorted_and_tests_seeds_against_the_anchored_model(tmp_path):
+    errors = {
+        "anchored": [2.0, 2.2, 2.4],
+        "GRU": [3.0, 3.5, 3.1],
+        "CfC": [1.0],
+        "last value": [8.0],
+    }
+    for model, each in errors.items():
+        for seed, mse in enumerate(each):
+            record = {"model": model, "seed": seed, "mse": mse, "parameters": 9, "epochs": 4}
+            path = tmp_path / f"{model}-{seed}.json"
+            path.write_text(json.dumps({**record, "seconds_per_epoch": 0.5}))
+    lines = irregular_walker.table(tmp_path).split("\n")[2:]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert [row[0] for row in rows] == ["CfC", "anchored", "GRU", "last value"]
+    p = stats.ttest_ind(errors["anchored"], errors["GRU"], equal_var=False).pvalue
+    assert rows[1][1:3] == ["2.200 ± 0.200", "0.275"]
+    assert rows[2][-2:] == ["3", f"{p:.2g}"]
+    assert rows[0][-2:] == ["1", ""]
+
+
 def test_a_linear_recurrent_unit_is_a_sum_of_decayed_inputs():
     unit = LRU(2, 3).double()
     x, gaps = torch.randn(1, 4, 2).double(), torch.tensor([[1.0, 0.5, 2.0, 0.25]]).double()
