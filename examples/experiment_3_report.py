@@ -134,6 +134,7 @@ def draw(found: Found, path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator
 
     across = min(4, len(found))
     down = -(-len(found) // across)
@@ -149,6 +150,7 @@ def draw(found: Found, path: Path) -> None:
                 axis.plot(np.arange(1, len(mean) + 1), mean, color=f"C{i}", label=name)
         axis.set_title(setting.name, fontsize=9)
         axis.set_yscale("log")
+        axis.yaxis.set_minor_locator(LogLocator(subs=(2, 3, 4, 5, 6, 8)))
         for each_axis in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
             each_axis("{x:g}")
         axis.grid(alpha=0.3, which="both")
