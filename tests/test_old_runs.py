@@ -67,6 +67,7 @@ def test_a_run_of_0_2_0_still_predicts_fills_forecasts_and_scores(tmp_path, caps
             assert [float(row[i]) for i in numbers] == pytest.approx(
                 [float(was[i]) for i in numbers], rel=1e-5, abs=1e-6
             )
+    assert "time is taken to be" not in capsys.readouterr().err  # the run keeps its unit
     blend, model = ob.load_run(run), ob.load_model(run)
     assert blend.forward.config == model.config
     capsys.readouterr()

@@ -25,6 +25,8 @@ FOUND = "found"
 
 Other logs are read with them where nothing states these options there, either."""
 
+_ASSUMED_TIME = "time is taken to be in"
+
 
 def say(result: Any, text: str, as_json: bool) -> None:
     """Prints a result as JSON or as text."""
@@ -57,7 +59,9 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
 
     options = reader_options(reader, run)
     found = options.pop(FOUND, None)
-    dataset = read(data, **options)
+    known_unit = isinstance(found, dict) and "time_unit" in found
+    with without_warnings(_ASSUMED_TIME if known_unit else None):  # it was printed in training
+        dataset = read(data, **options)
     if not isinstance(found, dict) or "found" not in dataset.meta:
         return dataset
     known = known_options(data, options)
@@ -135,18 +139,23 @@ def reader_options(reader: dict[str, Any] | None, run: Path | None) -> dict[str,
 
 
 @contextmanager
-def without_warnings() -> Iterator[None]:
-    """While this lasts, what readers assume is not printed as warnings."""
+def without_warnings(holding: str | None = "") -> Iterator[None]:
+    """While this lasts, what readers assume is not printed as warnings.
+
+    Args:
+        holding: only warnings with this text are left out; None leaves none out.
+    """
+
+    def is_printed(record: logging.LogRecord) -> bool:
+        left_out = holding is not None and holding in record.getMessage()
+        return record.levelno > logging.WARNING or not left_out
+
     logger = logging.getLogger("offbeat")
-    logger.addFilter(_no_warning)
+    logger.addFilter(is_printed)
     try:
         yield
     finally:
-        logger.removeFilter(_no_warning)
-
-
-def _no_warning(record: logging.LogRecord) -> bool:
-    return record.levelno > logging.WARNING
+        logger.removeFilter(is_printed)
 
 
 def known_options(
