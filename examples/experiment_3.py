@@ -40,6 +40,7 @@ MODELS = {
     "ODE-GRU-D": "ode_gru_d",
     "anchored": "anchored_ode_gru_d",
 }
+PREDICTORS = (*BASELINES, *MODELS)
 TRAINING = {"optimizer": "adam", "learning_rate": 0.004, "schedule": "cosine", "batch_size": 25}
 
 
@@ -95,6 +96,7 @@ def main() -> None:
     add("--trajectories", type=int, default=10_000)
     add("--epochs", type=int, default=50)
     add("--repeats", type=int, default=5)
+    add("--only", nargs="+", default=list(PREDICTORS), choices=PREDICTORS)
     add("--minutes", type=float, help="stop after the training that is in progress then")
     add("--document", type=Path, help="write the tables into this document instead")
     asked = parser.parse_args()
@@ -104,9 +106,8 @@ def main() -> None:
     torch.set_num_threads(1)
     stop = time.monotonic() + 60 * (asked.minutes or 1e9)
     simulated: dict[str, ob.Dataset] = {}
-    names = (*BASELINES, *MODELS)
     for repeat, robot, fraction, name in product(
-        range(asked.repeats), asked.robots, FRACTIONS, names
+        range(asked.repeats), asked.robots, FRACTIONS, asked.only
     ):
         words = f"{robot}-{asked.rows}-{100 * fraction:.0f}-{name.replace(' ', '_')}-{repeat}"
         path = RESULTS / f"{words}.json"
