@@ -1,7 +1,9 @@
 # Offbeat on the CPU, with the readers of robotics formats and the simulator:
 #   docker build -t offbeat .
 #   docker run --rm -v "$PWD":/data offbeat inspect arm.csv
+# Versions of Debian's packages are not pinned: it keeps only the latest of each.
 FROM python:3.12-slim-bookworm AS build
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install --yes --no-install-recommends g++ \
     && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
@@ -16,12 +18,13 @@ RUN python -m venv /opt/offbeat \
     && /opt/offbeat/bin/python -c "from offbeat import kernels; assert kernels.cpu.instruction_sets()"
 
 FROM python:3.12-slim-bookworm
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install --yes --no-install-recommends libegl1 libgl1-mesa-dri \
     && rm -rf /var/lib/apt/lists/*
 COPY --from=build /opt/offbeat /opt/offbeat
 ENV PATH=/opt/offbeat/bin:$PATH MUJOCO_GL=egl OMP_NUM_THREADS=1
-RUN useradd --create-home user
-USER user
+RUN useradd --create-home --uid 1000 user
+USER 1000
 WORKDIR /data
 ENTRYPOINT ["offbeat"]
 CMD ["--help"]
