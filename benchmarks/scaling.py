@@ -5,14 +5,18 @@ hidden 15, a vector field of four layers of 100 units). The points of a sweep ta
 proportion to the size has `per_unit` 1 everywhere.
 
     python benchmarks/scaling.py --json results/benchmarks/scaling.json
+
+`--figure` draws the sweeps, and the growth with the size of a data set that `shards.py` measured.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,16 +69,21 @@ def point(name: str, **changed: Any) -> Callable[[], None]:
     return step_of(data, name, hidden_size=size["hidden"], field_units=units)
 
 
-def in_turn(steps: dict[Any, Callable[[], None]], repeats: int) -> dict[Any, float]:
+CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
+
+
+def in_turn(
+    steps: dict[Any, Callable[[], None]], repeats: int, clock: Callable[[], float]
+) -> dict[Any, float]:
     """Median time of each step, ms; the steps take turns."""
     for step in steps.values():
         step()
     times: dict[Any, list[float]] = {key: [] for key in steps}
     for _ in range(repeats):
         for key, step in steps.items():
-            start = time.perf_counter()
+            start = clock()
             step()
-            times[key].append(1e3 * (time.perf_counter() - start))
+            times[key].append(1e3 * (clock() - start))
     return {key: statistics.median(each) for key, each in times.items()}
 
 
@@ -94,18 +103,68 @@ def under(step: Callable[[], None], **settings: int) -> Callable[[], None]:
     return changed
 
 
+LABELS = {
+    "rows": "rows of a trajectory",
+    "batch": "trajectories of a batch",
+    "hidden": "hidden units",
+    "units": "units of each layer of the vector field",
+}
+
+
+def draw(sweeps: dict[str, Any], shards: Path, figure_path: str) -> None:
+    """A panel for each size, beside a cost in proportion to it from the first point on."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
+
+    figure = Figure(figsize=(9, 5.4), layout="constrained")
+    panels = figure.subplots(2, 3).ravel()
+    panels[-1].axis("off")
+
+    def panel(axes: Any, sizes: list[float], costs: list[float], label: str, unit: str) -> None:
+        axes.loglog(sizes, costs, "o-", label="measured")
+        proportional = [costs[0] * x / sizes[0] for x in sizes]
+        axes.loglog(sizes, proportional, ":", color="0.6", label="in proportion")
+        axes.set(xlabel=label, ylabel=unit)
+        axes.set_xticks(sizes, [f"{x:g}" for x in sizes])
+        axes.minorticks_off()
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+
+    for axes, (what, label) in zip(panels, LABELS.items(), strict=False):
+        points = sweeps[what]
+        costs = [point["ms"] for point in points.values()]
+        panel(axes, [float(v) for v in points], costs, label, "loss and gradient, ms")
+    if shards.exists():
+        read = json.loads(shards.read_text(encoding="utf-8"))["sizes"]
+        costs = [each["epoch_cpu_s"] for each in read.values()]
+        panel(panels[4], [float(v) for v in read], costs, "data set in shards, GB", "an epoch, s")
+    panels[0].legend(frameon=False)
+    figure.savefig(figure_path, dpi=150)
+
+
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--model", default="ode_gru_d")
+    parser.add_argument(
+        "--clock",
+        choices=list(CLOCKS),
+        default="wall",
+        help="processor: time of all threads, for a busy machine",
+    )
     parser.add_argument("--json")
+    parser.add_argument("--figure")
+    parser.add_argument("--shards", type=Path, default=Path("results/benchmarks/shards.json"))
     options = parser.parse_args()
+    clock = CLOCKS[options.clock]
     torch.set_num_threads(options.threads)
     found: dict[str, Any] = {}
     for what, values in SWEEPS.items():
-        times = in_turn({v: point(options.model, **{what: v}) for v in values}, options.repeats)
+        times = in_turn(
+            {v: point(options.model, **{what: v}) for v in values}, options.repeats, clock
+        )
         first = times[values[0]] / float(values[0])
         found[what] = {
             str(v): {"ms": round(ms, 2), "per_unit": round(ms / float(v) / first, 2)}
@@ -121,6 +180,7 @@ def main() -> None:
             "30 rows at different times": step_of(own, options.model),
         },
         options.repeats,
+        clock,
     )
     found["different times"] = {"rows of the union": union, **times}
     print(f"different times: {times}, rows of the union: {union}")
@@ -131,16 +191,20 @@ def main() -> None:
             "recomputed": under(step, TAPE_LIMIT=0),
         },
         options.repeats,
+        clock,
     )
     found["inner activations"] = times
     print(f"inner activations: {times}")
     # "at the end": one product of all activations and gradients, after all rows.
     ways = {f"every {n} rows": under(step, ROWS_AT_ONCE=n) for n in (1, 2, 4, 8, 16, 32)}
     ways["at the end"] = under(step, ROWS_AT_ONCE=BASE["rows"])
-    times = in_turn(ways, options.repeats)
+    times = in_turn(ways, options.repeats, clock)
     found["weight gradients added"] = times
     print(f"weight gradients added: {times}")
-    write(options.json, {"machine": machine(), "options": vars(options), "sweeps": found})
+    if options.figure:
+        draw(found, options.shards, options.figure)
+    used = {k: v for k, v in vars(options).items() if k != "shards"}
+    write(options.json, {"machine": machine(), "options": used, "sweeps": found})
 
 
 if __name__ == "__main__":

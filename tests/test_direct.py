@@ -71,6 +71,16 @@ def test_steps_have_the_bits_of_autograd(name: str, dtype: torch.dtype, rows: in
     assert len(set(losses)) == len(BATCHES)
 
 
+def test_a_module_without_squares_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = recipe_of("gru", ob.TrainConfig(), validated=False)
+    found = []
+    for has_squares in (True, False):
+        monkeypatch.setattr(direct, "_has_squares", lambda has=has_squares: has)
+        found.append(trained(MODELS["gru"], recipe, autograd=False, rows=12, all_count=True))
+    assert found[0][0] == found[1][0]
+    assert torch.equal(found[0][1], found[1][1])
+
+
 def test_a_whole_training_has_the_bits_of_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
     data = ob.mask_out(dataset(12), 0.6, seed=0)
     train, validation = data[:9], data[9:]

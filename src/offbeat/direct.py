@@ -8,29 +8,23 @@ losses other than the mean squared error of all values.
 
 from __future__ import annotations
 
-from itertools import accumulate
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import mse_loss
 
 from offbeat.config import Recipe
 from offbeat.distributed import current
 from offbeat.examples import Examples
 from offbeat.kernels import StepTable, choose, cpu
 from offbeat.kernels.backends import BACKENDS, selected
+from offbeat.kernels.buffered import BufferedPerceptron, BufferedScan, PackedWeights
 from offbeat.kernels.optimizer import CompiledAdamax
-from offbeat.kernels.spec import ScanSpec, TableSteps
 from offbeat.models.base import BaseModel
 from offbeat.models.model import Model
 from offbeat.parts import Point
 from offbeat.parts.heads import Prediction
-from offbeat.run import FlatParameters, RunState
-
-_MEAN = 1
-"""Reduction of a loss, as torch's operators number it."""
+from offbeat.run import RunState
 
 
 def unsupported(model: BaseModel, examples: object, recipe: Recipe) -> str | None:
@@ -87,18 +81,20 @@ class DirectStep:
         self.asked = _asked(model)
         choice = choose(model.spec, model.dtype, model.device)
         self._optimizer = CompiledAdamax(state.optimizer, state.parameters.flat, choice.variant)
-        self._scan = _Scan(model.spec, choice.variant)
-        self._weights = _Packed(list(model.scan_parts().tensors()), self.parameters)
+        self._scan = BufferedScan(model.spec, choice.variant)
+        flat, gradient = state.parameters.flat, state.parameters.gradient
+        scanned = list(model.scan_parts().tensors())
+        self._weights = PackedWeights(scanned, flat, gradient)
         layers = model.head.layers
         self._decoder = None
         if layers:
             sizes = (layers[0][0].shape[1], *(weight.shape[0] for weight, _ in layers))
-            self._decoder = _Decoder(sizes, choice.variant)
-            self._decoder_weights = _Packed([t for layer in layers for t in layer], self.parameters)
+            self._decoder = BufferedPerceptron(sizes, choice.variant)
+            decoding = [tensor for layer in layers for tensor in layer]
+            self._decoder_weights = PackedWeights(decoding, flat, gradient)
         self._shifted = model.config.readout == "last_row"
         self._first = self._to_states = torch.empty(0)
         self._squares: tuple[Tensor, Tensor] | None = None
-        self._targets: Tensor | None = None
 
     def loss(self, index: Tensor) -> float:
         """The loss of some trajectories; `backward` continues from it.
@@ -116,12 +112,11 @@ class DirectStep:
             self._first[:, : self.model.channels] = self.model.start.detach()
         before, after = self._scan.forward(self._weights.gather(), rows, self._first)
         examples = self.examples
-        self._targets = self._squares = None
-        if examples.counted is None and examples.typical is None and rows.rows > 1:
-            if _has_squares() and (self._decoder is not None or not self._shifted):
-                self._squares = self._squared(before, after, index)
-                return float(self._squares[0].mean())
-            self._targets = examples.targets.index_select(0, index)[:, : rows.rows - 1]
+        self._squares = None
+        all_count = examples.counted is None and examples.typical is None and rows.rows > 1
+        if all_count and _has_squares() and (self._decoder is not None or not self._shifted):
+            self._squares = self._squared(before, after, index)
+            return float(self._squares[0].mean())
         read = before
         if self._shifted:
             read = torch.cat([self._first[:, None], after[:, :-1]], 1)
@@ -160,27 +155,16 @@ class DirectStep:
         return mean.view(*read.shape[:2], -1)
 
     def _loss_of(self, mean: Tensor, index: Tensor) -> float:
-        self._mean = mean
-        if self._targets is not None:
-            return float(mse_loss(mean[:, 1:], self._targets))
-        mean.requires_grad_()
+        self._mean = mean.requires_grad_()
         with torch.enable_grad():
             self._graph = self.examples.loss_of(self.model, Prediction(mean), index)
         return float(self._graph.detach())
 
     def _gradient(self) -> Tensor:
         """(batch, rows, channels) of the loss with respect to the prediction."""
-        if self._targets is None:
-            (self._graph * self._scale).backward()  # type: ignore[no-untyped-call]
-            assert self._mean.grad is not None
-            return self._mean.grad
-        found = torch.empty_like(self._mean)
-        found[:, 0] = 0
-        factor = self._mean.new_tensor(self._scale)
-        torch.ops.aten.mse_loss_backward.grad_input(
-            factor, self._mean[:, 1:], self._targets, _MEAN, grad_input=found[:, 1:]
-        )
-        return found
+        (self._graph * self._scale).backward()  # type: ignore[no-untyped-call]
+        assert self._mean.grad is not None
+        return self._mean.grad
 
     def backward(self) -> None:
         """Sets the gradients of the parameters to those of the newest loss."""
@@ -225,164 +209,6 @@ class DirectStep:
 def _asked(model: Model) -> tuple[Any, ...]:
     """What the choice of a backend for a model depends on."""
     return (*selected(), *BACKENDS, model.dtype, model.device)
-
-
-class _Packed:
-    """Parameters in one buffer, in the order of the compiled code."""
-
-    def __init__(self, parameters: list[Any], flat: FlatParameters) -> None:
-        # (parameters, 3): where each lies in `flat`, where in the buffer, and its length.
-        sizes = [p.numel() for p in parameters]
-        start, width = flat.flat.data_ptr(), flat.flat.element_size()
-        there = [(p.data_ptr() - start) // width for p in parameters]
-        here = [0, *accumulate(sizes)]
-        self._from = np.array([there, here[:-1], sizes], dtype=np.int64).T.copy()
-        self._to = self._from[:, [1, 0, 2]].copy()
-        self._flat = flat.flat.detach().numpy()
-        self._gradient = flat.gradient.numpy()
-        self._buffer = torch.empty(here[-1], dtype=flat.flat.dtype)
-
-    def gather(self) -> Tensor:
-        cpu.compiled.move_weights(self._buffer.numpy(), self._flat, self._to, False)
-        return self._buffer
-
-    def add(self, gradient: Tensor) -> None:
-        cpu.compiled.move_weights(self._gradient, gradient.numpy(), self._from, True)
-
-
-class _Scan:
-    """The two calls of a scan."""
-
-    def __init__(self, spec: ScanSpec, variant: str) -> None:
-        self._spec, self._own, self._variant = spec, cpu.compiled_spec(spec), variant
-        self._tape = torch.empty(0)
-        self._states = (torch.empty(0), torch.empty(0))
-
-    def forward(self, packed: Tensor, rows: TableSteps, state: Tensor) -> tuple[Tensor, Tensor]:
-        shape = (len(rows), rows.rows, self._spec.state_size)
-        self._states = before, after = tuple(  # type: ignore[assignment]
-            each if each.shape == shape else state.new_empty(shape) for each in self._states
-        )
-        self._inputs = cpu.compiled_inputs(rows, state.dtype)
-        self._packed, self._state, self._rows = packed, state, rows
-        size = cpu.tape_size(self._own, self._variant, self._inputs, state)
-        if size is None or self._tape.numel() != size:
-            self._tape = state.new_empty(size or 0)
-        cpu.compiled.scan_forward(
-            self._own,
-            self._variant,
-            packed.numpy(),
-            self._inputs,
-            state.numpy(),
-            before.numpy(),
-            after.numpy(),
-            None if size is None else self._tape.numpy(),
-            cpu.threads(),
-        )
-        self._kept = size is not None
-        return before, after
-
-    def backward(self, to_before: Tensor | None, to_after: Tensor | None) -> tuple[Tensor, Tensor]:
-        to_packed, to_first = torch.empty_like(self._packed), torch.empty_like(self._state)
-        cpu.compiled.scan_backward(
-            self._own,
-            self._variant,
-            self._packed.numpy(),
-            self._inputs,
-            self._state.numpy(),
-            self._states[1].numpy(),
-            self._tape.numpy() if self._kept else None,
-            None if to_before is None else to_before.numpy(),
-            None if to_after is None else to_after.numpy(),
-            to_packed.numpy(),
-            to_first.numpy(),
-            cpu.threads(),
-            cpu.ROWS_AT_ONCE,
-        )
-        return to_packed, to_first
-
-
-class _Decoder:
-    """The two calls of a perceptron."""
-
-    def __init__(self, sizes: tuple[int, ...], variant: str) -> None:
-        self._own, self._variant = cpu.compiled_perceptron(sizes, "tanh"), variant
-        self._outputs = sizes[-1]
-        self._tape = torch.empty(0)
-
-    def forward(self, packed: Tensor, x: Tensor) -> Tensor:
-        size = cpu.perceptron_tape_size(self._own, self._variant, x)
-        if self._tape.numel() != size:
-            self._tape = x.new_empty(size)
-        y = x.new_empty((len(x), self._outputs))
-        self._packed, self._x = packed, x
-        cpu.compiled.perceptron_forward(
-            self._own,
-            self._variant,
-            packed.numpy(),
-            x.numpy(),
-            y.numpy(),
-            self._tape.numpy(),
-            cpu.threads(),
-        )
-        return y
-
-    def squares(
-        self,
-        packed: Tensor,
-        states: Tensor,
-        first: Tensor | None,
-        column: int,
-        wanted: tuple[Any, ...],
-        squares: Tensor,
-        to_states: Any,
-    ) -> Tensor:
-        """Squared errors of predictions, and gradients of their mean.
-
-        Args:
-            packed: weights.
-            states: (batch, rows, state_size).
-            first: (batch, state_size) the state that row 0 is read from, and row i from that of
-                row i - 1; None: each row is read from its own.
-            column: of the first input in a state.
-            wanted: (trajectories, rows - 1 or more, outputs) targets of the rows after the first;
-                (batch,) which trajectories; two factors of the gradients.
-            squares: (batch, rows - 1, outputs) set to the squared errors.
-            to_states: (batch, rows, state_size) set where the inputs are.
-
-        Returns:
-            The gradient of the weights.
-        """
-        to_packed = torch.empty_like(packed)
-        cpu.compiled.perceptron_squares(
-            self._own,
-            self._variant,
-            packed.numpy(),
-            states.numpy(),
-            None if first is None else first.numpy(),
-            column,
-            *wanted,
-            squares.numpy(),
-            to_packed.numpy(),
-            to_states,
-            cpu.threads(),
-        )
-        return to_packed
-
-    def backward(self, to_y: Tensor) -> tuple[Tensor, Tensor]:
-        to_packed, to_x = torch.empty_like(self._packed), torch.empty_like(self._x)
-        cpu.compiled.perceptron_backward(
-            self._own,
-            self._variant,
-            self._packed.numpy(),
-            self._x.numpy(),
-            self._tape.numpy(),
-            to_y.numpy(),
-            to_packed.numpy(),
-            to_x.numpy(),
-            cpu.threads(),
-        )
-        return to_packed, to_x
 
 
 def _has_squares() -> bool:

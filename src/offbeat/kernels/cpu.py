@@ -45,6 +45,10 @@ stores only the states (`state_size` numbers per row, twice), and the backward p
 rest, a few rows at a time (`benchmarks/scaling.py` measures the cost). Larger blocks of memory are
 mapped anew at each call, which can cost more than to compute twice."""
 
+TAPE_LIMIT_WITHOUT_FIELD = 8 * 2**20
+"""Bytes. The same for scans without a vector field, whose activations take less time to compute
+than to bring back from outside of the caches of a core."""
+
 ROWS_AT_ONCE = 0
 """Rows whose weight gradients are added together; 0 for as many as have eight evaluations of the
 vector field (`benchmarks/scaling.py` measures others). It does not change the result: the order of
@@ -248,17 +252,18 @@ def compiled_inputs(rows: StepInputs | TableSteps, dtype: torch.dtype) -> Any:
     return made(**given, use_prediction=fed)
 
 
-def tape_size(own: Any, variant: str, inputs: Any, state: Tensor) -> int | None:
+def tape_size(spec: ScanSpec, variant: str, inputs: Any, state: Tensor) -> int | None:
     """Numbers that a forward pass stores for its backward pass; None for the states alone.
 
     Args:
-        own: from `compiled_spec`.
+        spec: of the scan.
         variant: name of an instruction set.
         inputs: from `compiled_inputs`.
         state: (batch, state_size) before the first step, contiguous.
     """
-    size: int = compiled.tape_size(own, variant, inputs, _array(state))
-    return size if size * state.element_size() <= TAPE_LIMIT else None
+    size: int = compiled.tape_size(compiled_spec(spec), variant, inputs, _array(state))
+    limit = TAPE_LIMIT if spec.field else min(TAPE_LIMIT, TAPE_LIMIT_WITHOUT_FIELD)
+    return size if size * state.element_size() <= limit else None
 
 
 class _Scan(Function):
@@ -280,7 +285,7 @@ class _Scan(Function):
         after = torch.empty_like(before)
         tape = None
         if keep:
-            size = tape_size(own, variant, inputs, state)
+            size = tape_size(spec, variant, inputs, state)
             tape = None if size is None else state.new_empty(size)
         ctx.threads = threads()
         compiled.scan_forward(
