@@ -129,6 +129,11 @@ def test_logs_of_other_programs_are_converted_one_by_one(tmp_path, capsys, monke
     ob.save(ob.Dataset((data[0],)), logs / "5.csv")
     converted.convert(logs, out / "converted", outliers="mask")
     assert read_again == [logs / "5.csv"]
+    (logs / "7.csv").unlink()
+    converted.convert(logs, out / "converted", outliers="mask")
+    assert len(ob.Dataset.open(out / "converted").shards) == 7
+    with pytest.raises(InputError, match="holds the logs; give another folder"):
+        converted.convert(logs, logs)
 
 
 def test_what_is_not_read_file_by_file_is_one_line(folder, tmp_path, capsys):
@@ -139,6 +144,8 @@ def test_what_is_not_read_file_by_file_is_one_line(folder, tmp_path, capsys):
     )
     (tmp_path / "none").mkdir()
     assert "holds no files" in error_of(capsys, "train", tmp_path / "none", out, "--lazy")
+    options = ["train", tmp_path / "none", out, "--lazy", "--two_sided"]
+    assert "--two_sided needs the data in memory" in error_of(capsys, *options)
     options = ["train", folder, out, "--lazy", "--two_sided"]
     assert "--two_sided needs the data in memory" in error_of(capsys, *options)
 

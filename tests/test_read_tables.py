@@ -228,6 +228,9 @@ class TestTimesOfIso8601:
         header = "trajectory,time,clock_ns,x,x|observed,x|low,x|high"
         rows = "0,0,17,1,true,1,1\n0,0.5,18,2,false,1,3\n"
         assert read(text_file(f"{header}\n{rows}"))[0].names == ("x",)
+        assert read(text_file(f"{header.replace('_ns', '_100ns')}\n{rows}"))[0].names == ("x",)
+        of_clock = read(text_file(f"{header.replace('x', 'clock_drift')}\n{rows}"))
+        assert of_clock[0].names == ("clock_drift",)
         wide = read(text_file("time,clock_ns,x\n0,17,1\n0.01,18,2\n"), channels=["clock_ns", "x"])
         assert wide[0].names == ("clock_ns", "x")
 

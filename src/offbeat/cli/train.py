@@ -220,6 +220,12 @@ def _opened_lazily(
         raise InputError(f"--lazy reads the files of a folder one by one, got {data}")
     if lazy is False or (not ours and not lazy):
         return None
+    needs_memory = InputError(
+        f"--two_sided needs the data in memory, and the files of {data} are read when they are "
+        "needed; leave it out"
+    )
+    if lazy and two_sided:
+        raise needs_memory
     if ours:
         opened = ShardedDataset.open(data)
     else:
@@ -229,10 +235,7 @@ def _opened_lazily(
     if not lazy and (free is None or opened.bytes <= LARGE * free):
         return None
     if two_sided:
-        raise InputError(
-            f"--two_sided needs the data in memory, and the files of {data} are read when they are "
-            "needed; leave it out"
-        )
+        raise needs_memory
     why = "" if lazy else f", more than {LARGE:.0%} of the {gigabytes(free or 0)} available"
     print(
         f"offbeat: {data}: {len(opened.shards)} files, {opened.rows} rows x {opened.channels} "

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import json
+import re
+import time
 from pathlib import Path
 from typing import Any
 
 from offbeat.data.readers import files_of, read
 from offbeat.data.shards import ShardedDataset
 from offbeat.data.store import save
-from offbeat.errors import FileFormatError, printable
+from offbeat.errors import FileFormatError, InputError, printable
 from offbeat.files import write_json
 
 MANIFEST = "converted.json"
 """What each file of the folder was converted from, and with which options."""
+
+SAVE_EVERY_S = 5.0
+"""Seconds from one writing of that to the next: many files make it long."""
 
 
 def convert(folder: str | Path, out: str | Path, **options: Any) -> ShardedDataset:
     """Reads each log of a folder alone, writes it as a data set, and opens what was written.
 
     Each file holds whole episodes: sensors in files of their own are not merged. What was converted
-    already, by the same options and from a file that did not change since, is kept.
+    already, by the same options and from a file that did not change since, is kept; what was
+    converted from a file that is gone is deleted.
 
     Args:
         folder: with logs of one format.
@@ -30,27 +36,34 @@ def convert(folder: str | Path, out: str | Path, **options: Any) -> ShardedDatas
     Raises:
         FileFormatError: there is no log in the folder, a file can't be read, or channels differ
             between files.
-        InputError: as of `read`.
+        InputError: as of `read`, or `out` is the folder of the logs.
     """
     folder, out = Path(folder), Path(out)
+    if folder.resolve() == out.resolve():
+        raise InputError(f"{folder} holds the logs; give another folder for the data sets")
     paths = files_of(folder, options.get("format"))
     if not paths:
         raise FileFormatError(f"{folder} holds no files that are read one by one, as tables are")
     out.mkdir(parents=True, exist_ok=True)
+    copies = [out / f"{i:06d}.parquet" for i in range(len(paths))]
+    wanted = {c.name: _stamp(path, options) for c, path in zip(copies, paths, strict=True)}
+    known = _known(out)
+    for name in known.keys() - wanted.keys():
+        (out / name).unlink(missing_ok=True)
+    made = {n: s for n, s in wanted.items() if known.get(n) == s and (out / n).exists()}
+    write_json(out / MANIFEST, made)  # without those that are about to change
+    written = time.monotonic()
     try:
-        known = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        known = {}
-    made: dict[str, Any] = {}
-    copies: list[Path] = []
-    for i, path in enumerate(paths):
-        copy, status = out / f"{i:06d}.parquet", path.stat()
-        stamp = [path.name, status.st_size, status.st_mtime_ns, json.dumps(options, default=str)]
-        if not copy.exists() or known.get(copy.name) != stamp:
+        for copy, path in zip(copies, paths, strict=True):
+            if copy.name in made:
+                continue
             save(read(path, **options), copy)
-        made[copy.name] = stamp
-        write_json(out / MANIFEST, {**known, **made})
-        copies.append(copy)
+            made[copy.name] = wanted[copy.name]
+            if time.monotonic() > written + SAVE_EVERY_S:
+                write_json(out / MANIFEST, made)
+                written = time.monotonic()
+    finally:
+        write_json(out / MANIFEST, made)
     try:
         return ShardedDataset.of_files(copies)
     except FileFormatError as error:
@@ -58,3 +71,19 @@ def convert(folder: str | Path, out: str | Path, **options: Any) -> ShardedDatas
         for copy, path in zip(copies, paths, strict=True):
             said = said.replace(str(copy), printable(str(path)))
         raise FileFormatError(said) from None
+
+
+def _stamp(path: Path, options: dict[str, Any]) -> list[Any]:
+    status = path.stat()
+    return [path.name, status.st_size, status.st_mtime_ns, json.dumps(options, default=str)]
+
+
+def _known(out: Path) -> dict[str, Any]:
+    """What was converted into the folder before, by the name of each file."""
+    try:
+        known = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(known, dict):
+        return {}
+    return {name: each for name, each in known.items() if re.fullmatch(r"\d{6,}\.parquet", name)}

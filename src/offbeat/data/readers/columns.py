@@ -7,7 +7,6 @@ channel, value), and holds one recording or, by a column of labels, several.
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from offbeat.data.readers.table_options import (
     column_named,
     first_known,
 )
+from offbeat.data.trajectory import SECONDS_PER
 from offbeat.errors import FileFormatError, listed, one_of
 
 _BESIDE = ("observed", "low", "high", "beyond")
@@ -238,7 +238,9 @@ def _of_answers(columns: Sequence[str]) -> set[str]:
     known = set(columns)
     parts = {column: column.rpartition("|") for column in columns}
     found = {c for c, (name, _, what) in parts.items() if name in known and what in _BESIDE}
-    return found | {c for c in columns if found and re.fullmatch("clock_[a-z]+", c)}
+    channels = {parts[column][0] for column in found}
+    clocks = {f"clock_{unit}" for unit in SECONDS_PER} & known - channels
+    return found | clocks if found else found
 
 
 def unit_written(header: Sequence[str], time: str) -> str | None:
