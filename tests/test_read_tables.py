@@ -220,6 +220,8 @@ class TestTimesOfIso8601:
             assert same(one.values[:, 0], [1, NAN, 2, NAN])
             assert dataset.meta["cleaning"]["notes"] == []
         assert read(path, units={"knee": "rad"})[0].units == ("rad", "rad", "")
+        robots = read(text_file("time,unit,value\n0,a,1\n0.1,b,2\n"), channel_column="unit")
+        assert robots[0].names == ("a", "b")
         mixed = read(text_file(f"time,channel,value,unit\n{rows}0.05,hip,3,deg\n"))
         assert mixed[0].units == ("", "deg", "")
         assert "'hip' has several units in column 'unit' (deg, rad)" in str(mixed.meta["cleaning"])

@@ -35,7 +35,7 @@ def clone_command(
         out: folder of the policy; an existing one is replaced.
         actions: names of the channels that are actions, such as --actions torque; by default those
             that the file marks as such.
-        model: name of a model, as offbeat models lists them.
+        model: name of a model, such as gru, gru_d, ode_rnn or anchored_ode_gru_d.
         low: lowest action per channel; by default the lowest of the demonstrations.
         high: highest action per channel.
         drop: fraction of the frames that are lost in training, at most; each window of each epoch

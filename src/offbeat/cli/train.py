@@ -72,7 +72,7 @@ def train_command(
             named.
         reader: options of reading the log; the run keeps them for the other commands.
         lazy: read the files of a folder when they are needed, and never all at once; logs of other
-            formats are first converted one by one into its folder converted. By default
+            formats are first converted one by one into the folder converted of the run. By default
             where data sets of Offbeat need more than a quarter of the available memory.
         seed: seed of the initial weights and of the order of training.
         threads: threads of PyTorch; one is fastest for models of this size.

@@ -97,7 +97,8 @@ class Columns:
             stamp.time, label, (), (), (), rest=stamp.rest, rest_unit=stamp.rest_unit,
             notes=stamp.notes,
         )  # fmt: skip
-        of_units = unit_column(rest, sample)
+        asked = (options.channel_column, options.value_column)
+        of_units = unit_column([name for name in rest if name not in asked], sample)
         beside = [name for name in rest if name != of_units]
         key, value = long_form(beside, options, sample)
         if key is not None and value is not None:
