@@ -132,6 +132,9 @@ def test_logs_of_other_programs_are_converted_one_by_one(tmp_path, capsys, monke
     (logs / "7.csv").unlink()
     converted.convert(logs, out / "converted", outliers="mask")
     assert len(ob.Dataset.open(out / "converted").shards) == 7
+    monkeypatch.undo()
+    (logs / "8.csv").write_text("time,x\n")  # without rows, which leaves it out
+    assert len(converted.convert(logs, out / "converted", outliers="mask").shards) == 7
     with pytest.raises(InputError, match="holds the logs; give another folder"):
         converted.convert(logs, logs)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import time
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from offbeat.data.readers import files_of, read
 from offbeat.data.shards import ShardedDataset
 from offbeat.data.store import save
-from offbeat.errors import FileFormatError, InputError, printable
+from offbeat.errors import FileFormatError, InputError, NoLogError, listed, printable
 from offbeat.files import write_json
 
 MANIFEST = "converted.json"
@@ -26,7 +27,8 @@ def convert(folder: str | Path, out: str | Path, **options: Any) -> ShardedDatas
 
     Each file holds whole episodes: sensors in files of their own are not merged. What was converted
     already, by the same options and from a file that did not change since, is kept; what was
-    converted from a file that is gone is deleted.
+    converted from a file that is gone is deleted. Files without rows or times are left out, which
+    is printed.
 
     Args:
         folder: with logs of one format.
@@ -53,19 +55,31 @@ def convert(folder: str | Path, out: str | Path, **options: Any) -> ShardedDatas
     made = {n: s for n, s in wanted.items() if known.get(n) == s and (out / n).exists()}
     write_json(out / MANIFEST, made)  # without those that are about to change
     written = time.monotonic()
+    refused: dict[str, NoLogError] = {}
     try:
         for copy, path in zip(copies, paths, strict=True):
             if copy.name in made:
                 continue
-            save(read(path, **options), copy)
+            try:
+                dataset = read(path, **options)
+            except NoLogError as error:
+                copy.unlink(missing_ok=True)
+                refused[path.name] = error
+                continue
+            save(dataset, copy)
             made[copy.name] = wanted[copy.name]
             if time.monotonic() > written + SAVE_EVERY_S:
                 write_json(out / MANIFEST, made)
                 written = time.monotonic()
     finally:
         write_json(out / MANIFEST, made)
+    if not made:
+        raise next(iter(refused.values()))
+    if refused:
+        note = f"{folder}: files without rows or times are left out: {listed([*refused], 6)}"
+        logging.getLogger("offbeat").warning("%s", printable(note))
     try:
-        return ShardedDataset.of_files(copies)
+        return ShardedDataset.of_files([copy for copy in copies if copy.name in made])
     except FileFormatError as error:
         said = str(error)
         for copy, path in zip(copies, paths, strict=True):
