@@ -114,27 +114,31 @@ def test_logs_of_other_programs_are_converted_one_by_one(tmp_path, capsys, monke
     for i, one in enumerate(data):
         ob.save(ob.Dataset((one,)), logs / f"{i}.csv")
     command = ["train", str(logs), str(out), "--lazy", *SMALL, "--split.window=20"]
+    command.append("--reader.time_column=time")
     assert main(command) == 0
     assert "8 files, 480 rows x 14 channels" in capsys.readouterr().err
     opened = ob.Dataset.open(out / "converted")
     assert [shard.rows for shard in opened.shards] == [(60,)] * 8
     assert np.allclose(opened.part(3)[0].values, data[3].values)
     assert main(["impute", str(out), str(logs / "3.csv"), str(tmp_path / "filled.csv")]) == 0
+    kept = json.loads((out / "reader.json").read_text())
+    assert (kept["outliers"], kept["time_column"]) == ("mask", "time")
+    assert main(["evaluate", str(out), str(out / "test.parquet")]) == 0  # read without these
 
     # Files that did not change are not read again; one that did is.
-    read_again = []
+    read_again, same = [], {"time_column": "time", "outliers": "mask"}
     monkeypatch.setattr(converted, "read", lambda path, **_: read_again.append(path) or data)
-    converted.convert(logs, out / "converted", outliers="mask")
+    converted.convert(logs, out / "converted", **same)
     assert read_again == []
     ob.save(ob.Dataset((data[0],)), logs / "5.csv")
-    converted.convert(logs, out / "converted", outliers="mask")
+    converted.convert(logs, out / "converted", **same)
     assert read_again == [logs / "5.csv"]
     (logs / "7.csv").unlink()
-    converted.convert(logs, out / "converted", outliers="mask")
+    converted.convert(logs, out / "converted", **same)
     assert len(ob.Dataset.open(out / "converted").shards) == 7
     monkeypatch.undo()
     (logs / "8.csv").write_text("time,x\n")  # without rows, which leaves it out
-    assert len(converted.convert(logs, out / "converted", outliers="mask").shards) == 7
+    assert len(converted.convert(logs, out / "converted", **same).shards) == 7
     with pytest.raises(InputError, match="holds the logs; give another folder"):
         converted.convert(logs, logs)
 

@@ -48,7 +48,7 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
     Args:
         data: the file.
         reader: options of `offbeat.read`. Those that are missing are taken from the run, unless
-            `format` is given.
+            `format` is given, or the file is a data set of ours, which is finished.
         run: folder of a run.
 
     Raises:
@@ -56,8 +56,10 @@ def read_log(data: Path, reader: dict[str, Any] | None, *, run: Path | None = No
         InputError: as `read`.
     """
     from offbeat.data.readers import read
+    from offbeat.data.store import holds_data_set
 
-    options = reader_options(reader, run)
+    finished = data.suffix.lower() in (".parquet", ".pq") and holds_data_set(data)
+    options = reader_options(reader, None if finished else run)
     found = options.pop(FOUND, None)
     known_unit = isinstance(found, dict) and "time_unit" in found
     with without_warnings(_ASSUMED_TIME if known_unit else None):  # it was printed in training

@@ -22,6 +22,9 @@ LARGE = 0.25
 TEST_FILE = "test.parquet"
 """Windows that a run on such a folder was scored on."""
 
+CONVERTED_WITH = {"outliers": "mask"}
+"""Options of reading logs that are converted one by one, unless others are given."""
+
 
 def train_command(
     data: Path,
@@ -93,7 +96,7 @@ def train_command(
     from offbeat.learning import learn
     from offbeat.learning_shards import learn_shards
     from offbeat.models.zoo import MODELS
-    from offbeat.run import locked
+    from offbeat.run import CONVERTED, locked
 
     if scaler is not None:
         one_of("scaler", scaler, SCALERS)
@@ -179,6 +182,8 @@ def train_command(
         else:
             save_split(out / "split.json", learned.split, dataset)
         meta = opened.meta if opened is not None else dataset.meta if dataset is not None else {}
+        if opened is not None and opened.shards[0].path.parent == out / CONVERTED:
+            reader = {**CONVERTED_WITH, **(reader or {})}
         if reader or "found" in meta:
             kept = {**(reader or {}), FOUND: meta.get("found", {})}
             write_json(out / READER_FILE, kept)
@@ -230,7 +235,7 @@ def _opened_lazily(
         opened = ShardedDataset.open(data)
     else:
         with busy(f"converting the files of {data} to {out / CONVERTED}"):
-            opened = convert(data, out / CONVERTED, **{"outliers": "mask", **(reader or {})})
+            opened = convert(data, out / CONVERTED, **{**CONVERTED_WITH, **(reader or {})})
     free = available_memory()
     if not lazy and (free is None or opened.bytes <= LARGE * free):
         return None

@@ -88,8 +88,8 @@ def convert(folder: str | Path, out: str | Path, **options: Any) -> ShardedDatas
 
 
 def _stamp(path: Path, options: dict[str, Any]) -> list[Any]:
-    status = path.stat()
-    return [path.name, status.st_size, status.st_mtime_ns, json.dumps(options, default=str)]
+    status, asked = path.stat(), json.dumps(options, default=str, sort_keys=True)
+    return [path.name, status.st_size, status.st_mtime_ns, asked]
 
 
 def _known(out: Path) -> dict[str, Any]:
