@@ -564,7 +564,8 @@ def test_a_kind_that_no_task_has_takes_the_next_that_one_has(two_rates):
         of_kind = table[:-1].reshape(-1, blend.both.keys.levels, *table.shape[1:])
         for kind in (usual, twice, many + usual):
             assert np.array_equal(of_kind[kind, :, 1], of_kind[many + twice, :, 1])
-        assert not np.array_equal(of_kind[many + usual, :, 0], of_kind[many + twice, :, 0])
+    # `of_kind` of the widths; the best weights of a channel that has both kinds may be the same.
+    assert not np.array_equal(of_kind[many + usual, :, 0], of_kind[many + twice, :, 0])
     ages = blend.stack.keys.bins.of_age(np.array([0.01, 0.1]))
     assert ages[0] < ages[1]
     short, own = (int(blend.stack.keys.usual[int(at)]) for at in ages)

@@ -151,6 +151,11 @@ class Keys:
         """(bins,) the kinds of motion as usual where nothing was observed in the meantime."""
         return np.arange(len(self.bins)) * self.each + LEVELS - 1
 
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """(keys,) True for kinds of motion as usual."""
+        return np.append(np.arange(len(self) - 1) % LEVELS == LEVELS - 1, False)
+
     def measured(self, usual: Array) -> NDArray[np.int64]:
         """(keys, channels) the kind of the least time of a channel in tasks, or a longer one.
 
@@ -410,7 +415,7 @@ def fit_stack(
     np.maximum.at(stack.reach, cells[0].channel, np.abs(moves))
     flexible = np.array([member.flexible for member in stack.members.values()])
     source = sources(errors[0], stack.keys.measured(usual_gaps(train)))
-    errors = [replace(e, source=source) for e in errors]
+    errors = [replace(e, source=source, moving=stack.keys.moving) for e in errors]
     errors[0] = as_if_refitted(errors[0], errors[1], flexible, train.channels)
     stack.weights = simplex_weights(errors[0], train.channels)
     held_out = stack.mix(later, validation)
@@ -421,15 +426,14 @@ def fit_stack(
 def joined(errors: Sequence[Errors]) -> Errors:
     """The errors of several sets of tasks."""
     shift = np.cumsum([0, *(int(e.task.max(initial=-1)) + 1 for e in errors)])
-    return Errors(
-        np.concatenate([e.key for e in errors]),
-        np.concatenate([e.channel for e in errors]),
-        np.concatenate([e.task + s for e, s in zip(errors, shift, strict=False)]),
-        np.concatenate([e.truth for e in errors]),
-        np.concatenate([e.predictions for e in errors]),
-        errors[0].count,
-        errors[0].group,
-        errors[0].source,
+    return replace(
+        errors[0],
+        key=np.concatenate([e.key for e in errors]),
+        channel=np.concatenate([e.channel for e in errors]),
+        task=np.concatenate([e.task + s for e, s in zip(errors, shift, strict=False)]),
+        truth=np.concatenate([e.truth for e in errors]),
+        predictions=np.concatenate([e.predictions for e in errors]),
+        cluster=None,
     )
 
 

@@ -22,8 +22,11 @@ POOLED = 6.0
 WORST = 16.0
 """Largest squared error in the pooled tasks, relative to that of the best predictor."""
 
-MANY = 100.0
-"""Independent tasks with which the mean squared error decides, and no longer single tasks."""
+MANY = 20.0
+"""Independent tasks of a time with which the mean squared error decides, and not single tasks."""
+
+MANY_AT_REST = 100.0
+"""The same at rest and in fills from both sides, of the longest time."""
 
 SELECTED = 2.0
 """Independent tasks with which selection of one predictor counts as much as averaging."""
@@ -66,6 +69,7 @@ class Errors:
             `sources`. By default each has its own.
         cluster: (values,) stretch of the data that the value is from; what is true in one need not
             be in the next. None where values are independent.
+        moving: (keys,) True for kinds of motion as usual; None where kinds do not differ in motion.
     """
 
     key: Integers
@@ -77,6 +81,7 @@ class Errors:
     group: Integers | None = None
     source: Integers | None = None
     cluster: Integers | None = None
+    moving: NDArray[np.bool_] | None = None
 
     @property
     def groups(self) -> Integers:
@@ -204,7 +209,8 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     what is minimised is the sum of log(1 + s / (f m)) over tasks, with m the mean of s, by
     iteratively reweighted least squares. The factor f grows with the number of independent tasks:
     with few of them, one large motion does not decide; with `MANY` of them and more, this is nearly
-    least squares. To the Gram matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of
+    least squares. Motion as usual has many independent tasks of short times in a short log too;
+    whether a channel at rest starts to move shows once in a while (`MANY_AT_REST`). To the Gram matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of
     the mean of the members' own errors: with few tasks, one member is selected rather than several
     averaged (Q-aggregation: Dai, Rigollet and Zhang 2012, Annals of Statistics 40(3)).
 
@@ -225,7 +231,7 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
         place[order], errors.task[order], weight[order], errors.keys * channels
     )
     missed, shape = missed[order], (errors.keys, channels)
-    saturation = (errors.count.min() / MANY) ** 2
+    saturation = np.repeat(_saturation(errors), channels)
     # First as if each task had the best predictor.
     squares = np.min([cells.squares(column) for column in missed.T], axis=0)
     weights = np.empty((*shape, predictors))
@@ -282,19 +288,19 @@ class _Cells:
         total = np.bincount(self.task, self.weight * missed**2)
         return np.asarray(total / np.maximum(self.total, 1e-300))
 
-    def gram(self, missed: Array, squares: Array, saturation: float) -> Array:
+    def gram(self, missed: Array, squares: Array, saturation: Array) -> Array:
         """(places, predictors, predictors) of errors, a task of large errors counting less.
 
         Args:
             missed: (values, predictors).
             squares: (tasks,) mean squared error with the weights so far.
-            saturation: multiple of its mean at which the influence of a task levels off.
+            saturation: (places,) multiple of its mean at which the influence of a task levels off.
         """
         places, predictors = len(self.bounds) - 1, missed.shape[1]
         total = np.bincount(self.of, self.total, minlength=places)
         summed = np.bincount(self.of, self.total * squares, minlength=places)
         mean = (summed / np.maximum(total, 1e-300))[self.of]
-        least = saturation * mean + EXACT
+        least = saturation[self.of] * mean + EXACT
         factor = (mean + least) / (squares + least)
         weight = self.weight * factor[self.task]
         gram = np.zeros((places, predictors, predictors))
@@ -302,6 +308,14 @@ class _Cells:
             values = missed[self.bounds[i] : self.bounds[i + 1]]
             gram[i] = (values * weight[self.bounds[i] : self.bounds[i + 1], None]).T @ values
         return gram
+
+
+def _saturation(errors: Errors) -> Array:
+    """(keys,) multiple of its mean at which the influence of a task levels off."""
+    least = np.full(errors.keys, (errors.count.min() / MANY_AT_REST) ** 2)
+    if errors.moving is None:
+        return least
+    return np.where(errors.moving, (errors.count / MANY) ** 2, least)
 
 
 def _pooled(shared: Array, effective: Array, groups: Integers) -> Array:
