@@ -210,9 +210,10 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     iteratively reweighted least squares. The factor f grows with the number of independent tasks:
     with few of them, one large motion does not decide; with `MANY` of them and more, this is nearly
     least squares. Motion as usual has many independent tasks of short times in a short log too;
-    whether a channel at rest starts to move shows once in a while (`MANY_AT_REST`). To the Gram matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of
-    the mean of the members' own errors: with few tasks, one member is selected rather than several
-    averaged (Q-aggregation: Dai, Rigollet and Zhang 2012, Annals of Statistics 40(3)).
+    whether a channel at rest starts to move shows once in a while (`MANY_AT_REST`). To the Gram
+    matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of the mean of the members'
+    own errors: with few tasks, one member is selected rather than several averaged (Q-aggregation:
+    Dai, Rigollet and Zhang 2012, Annals of Statistics 40(3)).
 
     Args:
         errors: on tasks that the predictors were not fitted to.
