@@ -21,23 +21,29 @@ JUMP = 25.0
 LARGEST = 1e4
 SMALLEST = 1e-6
 
+PASSES = 2
+"""Times that the usual start is measured; the first time starts at 1."""
+
 
 class LocalScale:
     """A running mean of squared errors one observation ahead, relative to those of training.
 
     Each observation is predicted by a damped slope; its squared error, divided by the mean one at
     that time since observation, enters a mean that forgets. The result is 1 where a channel moves
-    as it usually does, near 0 where it rests.
+    as it usually does, near 0 where it rests. Before there is an error, it is the median of
+    training: in a log that mostly rests, a trajectory is taken to rest until it moves.
 
     Attributes:
         slope: the predictor.
         middle: (bins,) mean logarithm of the times since observation in each bin.
         usual: (bins, channels) mean squared error of training, in squared units.
+        median: (channels,) median of the running mean in training.
     """
 
     slope: DampedSlope
     middle: Array
     usual: Array
+    median: Array
 
     def fit(self, tasks: Dataset) -> LocalScale:
         """Fits to tasks; returns itself.
@@ -64,11 +70,26 @@ class LocalScale:
         self.middle = np.where(many > 0, logs / np.maximum(many, 1), np.log(bins.middle))
         floor = 1e-12 * self.slope.scale**2
         self.usual = np.maximum(mean, floor)
+        self.median = np.ones(tasks.channels)
+        for _ in range(PASSES):
+            self.median = self._median(tasks)
         return self
+
+    def _median(self, tasks: Dataset) -> Array:
+        """(channels,) median of the running mean where it has an error; 1 where it never has."""
+        found: list[list[Array]] = [[] for _ in range(tasks.channels)]
+        for rows in padded(tasks):
+            square, seen = np.moveaxis(stepped(_Square(self), rows), -1, 0)
+            for channel, squares in enumerate(found):
+                counted = rows.known[..., channel] & (seen[..., channel] > 0)
+                squares.append(square[..., channel][counted])
+        every = (np.concatenate(squares) for squares in found)
+        return np.array([np.median(squares) if len(squares) else 1.0 for squares in every])
 
     def start(self, like: Any) -> State:
         """See `CausalBaseline`."""
-        return {**self.slope.start(like), "square": like + 1.0, "seen": like}
+        square = like + as_kind(self.median, like)
+        return {**self.slope.start(like), "square": square, "seen": like}
 
     def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
         """See `CausalBaseline`."""
@@ -120,14 +141,28 @@ class LocalScale:
 
     def arrays(self) -> dict[str, Array]:
         """See `Baseline`."""
-        return {**self.slope.arrays(), "usual": self.usual, "middle": self.middle}
+        own = {"usual": self.usual, "middle": self.middle, "median": self.median}
+        return {**self.slope.arrays(), **own}
 
     def restore(self, arrays: Mapping[str, Array]) -> LocalScale:
         """See `Baseline`."""
         self.usual, self.middle = np.asarray(arrays["usual"]), np.asarray(arrays["middle"])
+        # Blends of before 1.0 started at 1.
+        self.median = np.asarray(arrays.get("median", np.ones(self.usual.shape[1])))
+        own = ("usual", "middle", "median")
         self.slope = DampedSlope()
-        self.slope.restore({k: v for k, v in arrays.items() if k not in ("usual", "middle")})
+        self.slope.restore({k: v for k, v in arrays.items() if k not in own})
         return self
+
+
+class _Square:
+    """Reads the running mean, and how many errors are in it."""
+
+    def __init__(self, of: LocalScale) -> None:
+        self.start, self.observe = of.start, of.observe
+
+    def read(self, state: State, time: Any) -> Any:
+        return np.stack([state["square"], state["seen"]], -1)
 
 
 class _Age:
