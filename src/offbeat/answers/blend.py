@@ -393,13 +393,17 @@ def fit_blend(
         source=source,
         cluster=clusters_of(parts[1], cells.task, cells.row),
     )
+    # Intervals are of the kinds that are known when an answer is given.
+    asked = stack.keys.cells(parts[1])
     gamma, answer = gated(
         errors,
         errors.predictions[:, 0],
         None if models is None else cells.pick(models),
         train.channels,
-        cells.place,
+        asked.place,
     )
+    unit = cells.unit / asked.unit
+    missed = replace(errors, key=asked.key, truth=errors.truth * unit)
     blend = Blend(
         train.names,
         train.units,
@@ -408,7 +412,7 @@ def fit_blend(
         config,
         stack,
         gamma,
-        fit_half_widths(errors, answer, train.channels),
+        fit_half_widths(missed, answer * unit, train.channels),
         both=None,  # type: ignore[arg-type]  # below
         forward=model,
         backward=backward,

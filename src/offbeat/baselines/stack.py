@@ -14,6 +14,7 @@ from offbeat.baselines.base import (
     Array,
     Baseline,
     CausalBaseline,
+    Rows,
     State,
     as_index,
     as_kind,
@@ -33,6 +34,9 @@ ACTIVITY = (-1.5, -0.5)
 """Bounds of log10 of the local scale: a channel rests, moves little, or moves as usual."""
 
 LEVELS = len(ACTIVITY) + 1
+
+ENOUGH = 5
+"""Observations of a channel that show how it moves, when errors are measured."""
 
 FEW = 1e-3
 """Weight of the last value beside the members that are used out of the range of training."""
@@ -190,12 +194,19 @@ class Keys:
         unit = xp.where(xp.isinf(age), as_kind(self.local.slope.scale, kind), usual)
         return unit * kind[..., 1] ** 0.25
 
-    def cells(self, tasks: Dataset) -> Cells:
-        """The known values of tasks."""
+    def cells(self, tasks: Dataset, *, afterwards: bool = False) -> Cells:
+        """The known values of tasks.
+
+        Args:
+            tasks: masked.
+            afterwards: whether the first values of a trajectory, before it is known how it moves,
+                have the kinds of those that follow. What is learned of a channel at rest comes
+                then from channels at rest alone.
+        """
         parts: list[tuple[NDArray[Any], ...]] = []
         first = 0
         for rows in padded(tasks):
-            read = stepped(self, rows)
+            read = stepped(_Afterwards.of(self, rows) if afterwards else self, rows)
             task, row, channel = np.nonzero(rows.known)
             key, square, _, last, _ = np.moveaxis(read[task, row, channel], -1, 0)
             place = self.place(read)[task, row, channel]
@@ -207,6 +218,38 @@ class Keys:
         task, row, channel, key, at, part, square, unit, last, truth = flat
         place = Place(at, part, (self.each, LEVELS))
         return Cells(task, row, channel, key, place, square, unit, last, truth)
+
+
+@dataclass(frozen=True, eq=False)
+class _Afterwards:
+    """Kinds of trajectories whose present motion is known from the start.
+
+    Attributes:
+        keys: of the kinds.
+        square: (batch, channels) local scale at the start.
+    """
+
+    keys: Keys
+    square: Array
+
+    @classmethod
+    def of(cls, keys: Keys, rows: Rows) -> _Afterwards:
+        """With the local scale after `ENOUGH` observations, or after all."""
+        square = stepped(keys.local, rows)
+        enough = rows.observed.cumsum(axis=1) >= ENOUGH
+        # It is read before a row is observed.
+        after = enough.argmax(axis=1) + 1
+        after = np.where(enough.any(axis=1), np.minimum(after, square.shape[1] - 1), -1)
+        return cls(keys, np.take_along_axis(square, after[:, None], axis=1)[:, 0])
+
+    def start(self, like: Any) -> State:
+        return {**self.keys.start(like), "square": self.square}
+
+    def observe(self, state: State, time: Any, values: Any, mask: Any) -> State:
+        return self.keys.observe(state, time, values, mask)
+
+    def read(self, state: State, time: Any) -> Any:
+        return self.keys.read(state, time)
 
 
 def independent_tasks(ages: Array, span_s: float, gap_s: float) -> Array:
@@ -391,8 +434,9 @@ def fit_stack(
         budget_s: s, for the fits; see `fit_members`.
 
     Returns:
-        The stack, the values of the validation tasks, the stack's predictions of these tasks with
-        weights fitted to the training tasks alone, and (keys, channels) `Errors.source`.
+        The stack, the values of the validation tasks (`Keys.cells`, afterwards), the stack's
+        predictions of these tasks with weights fitted to the training tasks alone, and (keys,
+        channels) `Errors.source`.
     """
     stack = Stack()
     stack.mean, stack.scale = moments(train)
@@ -405,7 +449,7 @@ def fit_stack(
         stack.members[name] = member.baseline
     predicted, later = [m.train for m in found.values()], [m.validation for m in found.values()]
     count = independent_tasks(stack.keys.ages(), span_s, gap_s)
-    cells = [stack.keys.cells(tasks) for tasks in (train, validation)]
+    cells = [stack.keys.cells(tasks, afterwards=True) for tasks in (train, validation)]
     errors = [
         errors_of(c, p, count, stack.keys.groups)
         for c, p in zip(cells, (predicted, later), strict=True)
