@@ -13,8 +13,9 @@ from offbeat.answers.blend import fit_blend, tables_of
 from offbeat.answers.both_sides import SideMotion, Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
 from offbeat.baselines.history import AgeBins, filled_bins
+from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.stack import LEVELS as MOTIONS
-from offbeat.baselines.stack import Stack, kinds_of
+from offbeat.baselines.stack import Keys, Stack, kinds_of
 from offbeat.baselines.weights import (
     Errors,
     as_if_refitted,
@@ -329,6 +330,42 @@ def test_a_single_wild_value_does_not_look_like_motion_for_long(blend):
     assert np.array_equal(wild[:61], usual[:61])
     assert (wild[62, :, 1] > 5).all(), "it is seen"
     assert (wild[rows > 110, :, 1] < 2 * usual[rows > 110, :, 1]).all()
+
+
+def rests_and_moves(seed: int, count: int, moving: float) -> ob.Dataset:
+    """White noise of 1e-3, and of 1 in a part of the trajectories, which move all the time."""
+    random = np.random.default_rng(seed)
+    size = np.where(np.arange(count) < moving * count, 1.0, 1e-3)
+    times = 0.01 * np.arange(60)
+    return ob.Dataset(tuple(ob.Trajectory(times, random.normal(0, s, (60, 1))) for s in size))
+
+
+@pytest.mark.parametrize(("moving", "level"), [(0.2, 0), (0.8, MOTIONS - 1)])
+def test_a_trajectory_starts_as_most_of_training_is(moving, level):
+    keys = Keys(AgeBins(np.array([0.02, 0.3])), LocalScale().fit(rests_and_moves(0, 40, moving)))
+    kind = kinds_of(keys, rests_and_moves(1, 1, moving=0.0))[0][:, 0]
+    # No error is measured before the third observation.
+    assert kind[1, 0] % MOTIONS == kind[2, 0] % MOTIONS == level
+    assert kind[40, 0] % MOTIONS == 0
+
+
+def test_the_first_values_of_a_task_teach_about_the_motion_that_follows():
+    data = rests_and_moves(0, 40, moving=0.2)
+    keys = Keys(AgeBins(np.array([0.02, 0.3])), LocalScale().fit(data))
+    found, asked = keys.cells(data, afterwards=True), keys.cells(data)
+    assert np.array_equal(found.row, asked.row)
+    first = (found.row == 1) | (found.row == 2)
+    moves = found.task < 8
+    assert (found.key[first & moves] % MOTIONS == MOTIONS - 1).all()
+    assert (found.key[first & ~moves] % MOTIONS == 0).all()
+    assert (asked.key[first] % MOTIONS == 0).all(), "beforehand, all seem to rest"
+
+
+def test_blends_saved_before_the_start_was_measured_start_at_the_usual_motion(blend):
+    old = blend.stack.keys.local.arrays()
+    assert (old.pop("median") < 1).all()
+    local = LocalScale().restore(old)
+    assert np.array_equal(local.start(np.zeros((2, 3)))["square"], np.ones((2, 3)))
 
 
 # --- with models ----------------------------------------------------------------------------------
