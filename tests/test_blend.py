@@ -17,6 +17,8 @@ from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.stack import LEVELS as MOTIONS
 from offbeat.baselines.stack import Keys, Stack, kinds_of
 from offbeat.baselines.weights import (
+    CAUTION,
+    POOLED,
     Errors,
     as_if_refitted,
     gate,
@@ -84,6 +86,21 @@ def test_one_large_motion_decides_only_where_there_are_many_like_it():
     many = simplex_weights(errors_from(np.zeros(20), missed, count=1e6), 1)
     assert few[0, 0, 0] > 0.95
     assert many[0, 0, 1] > 0.95
+
+
+def test_usual_motion_is_weighed_by_the_spans_of_its_own_time():
+    # The same in 1000 spans of a row as in 3 of a second; a short time has many in a short log.
+    missed = np.vstack([np.tile([0.1, 1.0], (19, 1)), [20.0, 2.0]])
+    key = np.repeat([0, 1], 20)
+    errors = errors_from(np.zeros(40), np.tile(missed, (2, 1)), key=key)
+    errors = replace(errors, count=np.array([1000.0, 3.0]))
+    resting, moving = (
+        simplex_weights(replace(errors, moving=moving), 1)
+        for moving in (None, np.array([True, True]))
+    )
+    assert (resting[:, 0, 0] > 0.95).all()
+    assert moving[0, 0, 1] > 0.95
+    assert moving[1, 0, 0] > 0.9
 
 
 def test_weights_in_other_units_are_the_same():
@@ -155,6 +172,23 @@ def test_gamma_is_smaller_where_it_differs_between_stretches_of_the_data():
     error = 0.25 * np.sqrt(4 / 3)
     assert gamma(differs, cluster) == pytest.approx(gamma(differs, None) - error)
     assert gamma(half, 0 * cluster) == 0.0, "one stretch says nothing about the next"
+
+
+def test_a_model_that_is_right_about_a_large_motion_is_not_used_at_rest():
+    # It misses by 10 where the base misses by 1, and once it is right and the base misses by 200.
+    base, model = np.zeros(40), np.tile([11.0, -9.0], 20)
+    truth = np.ones(40)
+    truth[7] = model[7] = 200.0
+    few, many = (
+        gate(errors_from(truth, base[:, None], count=count), base, model, 1)[0, 0]
+        for count in (30.0, 1e6)
+    )
+    assert few < 0.05
+    # At rest 49 / 3959, and 400 / 400 of a weight of (20 / 200)^2: 449 / 4359, drawn to 0 by 2 of 40.
+    pooled = 449 / 4359 * 40 / 42
+    typical = 4359 / 40
+    expected = (449 + POOLED * pooled * typical) / (4359 + (POOLED + CAUTION) * typical)
+    assert many == pytest.approx(expected, abs=1e-4)
 
 
 def test_gamma_of_a_channel_that_is_well_predicted_does_not_come_from_another_one():

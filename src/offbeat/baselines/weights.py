@@ -289,6 +289,20 @@ class _Cells:
         total = np.bincount(self.task, self.weight * missed**2)
         return np.asarray(total / np.maximum(self.total, 1e-300))
 
+    def factor(self, squares: Array, saturation: Array) -> Array:
+        """(tasks,) what a task counts: less where its error is large.
+
+        Args:
+            squares: (tasks,) mean squared errors.
+            saturation: (places,) multiple of its mean at which the influence of a task levels off.
+        """
+        places = len(self.bounds) - 1
+        total = np.bincount(self.of, self.total, minlength=places)
+        summed = np.bincount(self.of, self.total * squares, minlength=places)
+        mean = (summed / np.maximum(total, 1e-300))[self.of]
+        least = saturation[self.of] * mean + EXACT
+        return np.asarray((mean + least) / (squares + least))
+
     def gram(self, missed: Array, squares: Array, saturation: Array) -> Array:
         """(places, predictors, predictors) of errors, a task of large errors counting less.
 
@@ -298,11 +312,7 @@ class _Cells:
             saturation: (places,) multiple of its mean at which the influence of a task levels off.
         """
         places, predictors = len(self.bounds) - 1, missed.shape[1]
-        total = np.bincount(self.of, self.total, minlength=places)
-        summed = np.bincount(self.of, self.total * squares, minlength=places)
-        mean = (summed / np.maximum(total, 1e-300))[self.of]
-        least = saturation[self.of] * mean + EXACT
-        factor = (mean + least) / (squares + least)
+        factor = self.factor(squares, saturation)
         weight = self.weight * factor[self.task]
         gram = np.zeros((places, predictors, predictors))
         for i in np.flatnonzero(np.diff(self.bounds)):
@@ -381,8 +391,9 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
 
     The least-squares factor of model - base, drawn to that of all channels of the key by `POOLED`
     tasks, and to 0 by `CAUTION`, as that of all channels is. A kind with fewer than `POOLED` tasks
-    has the factor of its group. One standard error is subtracted: a factor that differs between
-    stretches of the data (`Errors.cluster`) is not one of the next stretch.
+    has the factor of its group. A task of large errors counts less, as in `simplex_weights`. One
+    standard error is subtracted: a factor that differs between stretches of the data
+    (`Errors.cluster`) is not one of the next stretch.
 
     Args:
         errors: on tasks that neither the base nor the model was fitted to.
@@ -397,7 +408,35 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     moved, left = np.clip(model - base, -FARTHEST, FARTHEST), errors.truth - base
     weight = weight * _robust(left[:, None])
     place = errors.key * channels + errors.channel
-    shape = (errors.keys, channels)
+    order = np.argsort(place, kind="stable")
+    cells = _Cells.of_values(
+        place[order], errors.task[order], weight[order], errors.keys * channels
+    )
+    saturation = np.repeat(_saturation(errors), channels)
+    # First as if each task had the better of both.
+    squares = np.minimum(cells.squares(left[order]), cells.squares((left - moved)[order]))
+    for _ in range(ROUNDS):
+        counted = np.empty_like(weight)
+        counted[order] = cells.weight * cells.factor(squares, saturation)[cells.task]
+        gamma = _factor(errors, counted, effective, moved, left)
+        mixed = left - gamma[errors.key, errors.channel] * moved
+        squares = cells.squares(mixed[order])
+    uncertain = _uncertainty(errors, counted, moved, left, effective.shape)
+    return errors.placed(np.maximum(gamma - uncertain, 0.0))
+
+
+def _factor(errors: Errors, weight: Array, effective: Array, moved: Array, left: Array) -> Array:
+    """(keys, channels) the least-squares factor of left on moved, drawn to others and to 0.
+
+    Args:
+        errors: of tasks.
+        weight: (values,) of the values.
+        effective: (keys, channels) numbers of tasks.
+        moved: (values,) difference of the model from the base.
+        left: (values,) what the base misses.
+    """
+    shape = effective.shape
+    place = errors.key * shape[1] + errors.channel
 
     def summed(value: Array) -> Array:
         found = np.bincount(place, weight * value, minlength=shape[0] * shape[1])
@@ -430,8 +469,7 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     # No least-squares factor is larger (Cauchy and Schwarz): where the model moves much further
     # than the base is wrong, what it says in other channels does not count.
     largest = np.sqrt(least / np.maximum(square, 1e-300))
-    gamma = np.clip(np.minimum(gamma, largest), 0.0, 1.0)
-    return errors.placed(np.maximum(gamma - _uncertainty(errors, weight, moved, left, shape), 0.0))
+    return np.clip(np.minimum(gamma, largest), 0.0, 1.0)
 
 
 def _uncertainty(
