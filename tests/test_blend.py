@@ -184,7 +184,7 @@ def test_a_model_that_is_right_about_a_large_motion_is_not_used_at_rest():
         for count in (30.0, 1e6)
     )
     assert few < 0.05
-    # At rest 49 / 3959, and 400 / 400 of a weight of (20 / 200)^2: 449 / 4359, drawn to 0 by 2 of 40.
+    # At rest 49 / 3959, and 400 / 400 with a weight of (20 / 200)^2; drawn to 0 by 2 of 40.
     pooled = 449 / 4359 * 40 / 42
     typical = 4359 / 40
     expected = (449 + POOLED * pooled * typical) / (4359 + (POOLED + CAUTION) * typical)
