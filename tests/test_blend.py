@@ -88,21 +88,6 @@ def test_one_large_motion_decides_only_where_there_are_many_like_it():
     assert many[0, 0, 1] > 0.95
 
 
-def test_usual_motion_is_weighed_by_the_spans_of_its_own_time():
-    # The same in 1000 spans of a row as in 3 of a second; a short time has many in a short log.
-    missed = np.vstack([np.tile([0.1, 1.0], (19, 1)), [20.0, 2.0]])
-    key = np.repeat([0, 1], 20)
-    errors = errors_from(np.zeros(40), np.tile(missed, (2, 1)), key=key)
-    errors = replace(errors, count=np.array([1000.0, 3.0]))
-    resting, moving = (
-        simplex_weights(replace(errors, moving=moving), 1)
-        for moving in (None, np.array([True, True]))
-    )
-    assert (resting[:, 0, 0] > 0.95).all()
-    assert moving[0, 0, 1] > 0.95
-    assert moving[1, 0, 0] > 0.9
-
-
 def test_weights_in_other_units_are_the_same():
     random = np.random.default_rng(0)
     truth = random.normal(0, 1, 40)

@@ -392,7 +392,6 @@ def fit_blend(
         errors_of(cells, [held_out], count_of, stack.keys.groups),
         source=source,
         cluster=clusters_of(parts[1], cells.task, cells.row),
-        moving=stack.keys.moving,
     )
     # Intervals are of the kinds that are known when an answer is given.
     asked = stack.keys.cells(parts[1])

@@ -155,11 +155,6 @@ class Keys:
         """(bins,) the kinds of motion as usual where nothing was observed in the meantime."""
         return np.arange(len(self.bins)) * self.each + LEVELS - 1
 
-    @property
-    def moving(self) -> NDArray[np.bool_]:
-        """(keys,) True for kinds of motion as usual."""
-        return np.append(np.arange(len(self) - 1) % LEVELS == LEVELS - 1, False)
-
     def measured(self, usual: Array) -> NDArray[np.int64]:
         """(keys, channels) the kind of the least time of a channel in tasks, or a longer one.
 
@@ -459,7 +454,7 @@ def fit_stack(
     np.maximum.at(stack.reach, cells[0].channel, np.abs(moves))
     flexible = np.array([member.flexible for member in stack.members.values()])
     source = sources(errors[0], stack.keys.measured(usual_gaps(train)))
-    errors = [replace(e, source=source, moving=stack.keys.moving) for e in errors]
+    errors = [replace(e, source=source) for e in errors]
     errors[0] = as_if_refitted(errors[0], errors[1], flexible, train.channels)
     stack.weights = simplex_weights(errors[0], train.channels)
     held_out = stack.mix(later, validation)

@@ -22,11 +22,8 @@ POOLED = 6.0
 WORST = 16.0
 """Largest squared error in the pooled tasks, relative to that of the best predictor."""
 
-MANY = 20.0
-"""Independent tasks of a time with which the mean squared error decides, and not single tasks."""
-
-MANY_AT_REST = 100.0
-"""The same at rest and in fills from both sides, of the longest time."""
+MANY = 100.0
+"""Independent tasks with which the mean squared error decides, and no longer single tasks."""
 
 SELECTED = 2.0
 """Independent tasks with which selection of one predictor counts as much as averaging."""
@@ -69,7 +66,6 @@ class Errors:
             `sources`. By default each has its own.
         cluster: (values,) stretch of the data that the value is from; what is true in one need not
             be in the next. None where values are independent.
-        moving: (keys,) True for kinds of motion as usual; None where kinds do not differ in motion.
     """
 
     key: Integers
@@ -81,7 +77,6 @@ class Errors:
     group: Integers | None = None
     source: Integers | None = None
     cluster: Integers | None = None
-    moving: NDArray[np.bool_] | None = None
 
     @property
     def groups(self) -> Integers:
@@ -209,11 +204,9 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
     what is minimised is the sum of log(1 + s / (f m)) over tasks, with m the mean of s, by
     iteratively reweighted least squares. The factor f grows with the number of independent tasks:
     with few of them, one large motion does not decide; with `MANY` of them and more, this is nearly
-    least squares. Motion as usual has many independent tasks of short times in a short log too;
-    whether a channel at rest starts to move shows once in a while (`MANY_AT_REST`). To the Gram
-    matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of the mean of the members'
-    own errors: with few tasks, one member is selected rather than several averaged (Q-aggregation:
-    Dai, Rigollet and Zhang 2012, Annals of Statistics 40(3)).
+    least squares. To the Gram matrix of n tasks a part of `SELECTED` / (`SELECTED` + n) is added of
+    the mean of the members' own errors: with few tasks, one member is selected rather than several
+    averaged (Q-aggregation: Dai, Rigollet and Zhang 2012, Annals of Statistics 40(3)).
 
     Args:
         errors: on tasks that the predictors were not fitted to.
@@ -232,7 +225,7 @@ def simplex_weights(errors: Errors, channels: int) -> Array:
         place[order], errors.task[order], weight[order], errors.keys * channels
     )
     missed, shape = missed[order], (errors.keys, channels)
-    saturation = np.repeat(_saturation(errors), channels)
+    saturation = _saturation(errors)
     # First as if each task had the best predictor.
     squares = np.min([cells.squares(column) for column in missed.T], axis=0)
     weights = np.empty((*shape, predictors))
@@ -289,27 +282,27 @@ class _Cells:
         total = np.bincount(self.task, self.weight * missed**2)
         return np.asarray(total / np.maximum(self.total, 1e-300))
 
-    def factor(self, squares: Array, saturation: Array) -> Array:
+    def factor(self, squares: Array, saturation: float) -> Array:
         """(tasks,) what a task counts: less where its error is large.
 
         Args:
             squares: (tasks,) mean squared errors.
-            saturation: (places,) multiple of its mean at which the influence of a task levels off.
+            saturation: multiple of its mean at which the influence of a task levels off.
         """
         places = len(self.bounds) - 1
         total = np.bincount(self.of, self.total, minlength=places)
         summed = np.bincount(self.of, self.total * squares, minlength=places)
         mean = (summed / np.maximum(total, 1e-300))[self.of]
-        least = saturation[self.of] * mean + EXACT
+        least = saturation * mean + EXACT
         return np.asarray((mean + least) / (squares + least))
 
-    def gram(self, missed: Array, squares: Array, saturation: Array) -> Array:
+    def gram(self, missed: Array, squares: Array, saturation: float) -> Array:
         """(places, predictors, predictors) of errors, a task of large errors counting less.
 
         Args:
             missed: (values, predictors).
             squares: (tasks,) mean squared error with the weights so far.
-            saturation: (places,) multiple of its mean at which the influence of a task levels off.
+            saturation: multiple of its mean at which the influence of a task levels off.
         """
         places, predictors = len(self.bounds) - 1, missed.shape[1]
         factor = self.factor(squares, saturation)
@@ -321,12 +314,9 @@ class _Cells:
         return gram
 
 
-def _saturation(errors: Errors) -> Array:
-    """(keys,) multiple of its mean at which the influence of a task levels off."""
-    least = np.full(errors.keys, (errors.count.min() / MANY_AT_REST) ** 2)
-    if errors.moving is None:
-        return least
-    return np.where(errors.moving, (errors.count / MANY) ** 2, least)
+def _saturation(errors: Errors) -> float:
+    """Multiple of its mean at which the influence of a task levels off."""
+    return float((errors.count.min() / MANY) ** 2)
 
 
 def _pooled(shared: Array, effective: Array, groups: Integers) -> Array:
@@ -412,7 +402,7 @@ def gate(errors: Errors, base: Array, model: Array, channels: int) -> Array:
     cells = _Cells.of_values(
         place[order], errors.task[order], weight[order], errors.keys * channels
     )
-    saturation = np.repeat(_saturation(errors), channels)
+    saturation = _saturation(errors)
     # First as if each task had the better of both.
     squares = np.minimum(cells.squares(left[order]), cells.squares((left - moved)[order]))
     for _ in range(ROUNDS):
