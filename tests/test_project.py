@@ -43,7 +43,7 @@ def changelog_heading():
 def test_the_address_is_set_in_all_files_by_the_commands_of_the_release_guide(tmp_path):
     files = ("pyproject.toml", "CITATION.cff", "mkdocs.yml")
     guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    commands = re.findall(r"^sed -i .+$", guide, re.MULTILINE)
+    commands = re.findall(r"^sed -i\.bak .+$", guide, re.MULTILINE)
     assert len(commands) == 2
     for name in files:
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
