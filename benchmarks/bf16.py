@@ -1,8 +1,9 @@
-"""What products in bfloat16 could gain: one layer of a vector field against float32.
+"""Training steps with products in bfloat16 against float32, and what they cost in accuracy.
 
-The layer, compiled here, has the layout of the scan ([unit][lane], 32 trajectories) and as many
-units as inputs. Eight layers take turns, so that weights come from the cache as in a scan. It needs
-a processor with AVX512-BF16.
+Steps are those of a training (forward, backward, optimizer), one thread, in turns within one
+process: the compiled backend in float32 and in each instruction set for bfloat16 that the processor
+has, and the reference backend in float32 and under autocast, which uses the same instructions.
+Then the same trainings on recordings of the hopper in both precisions (needs MuJoCo).
 
     python benchmarks/bf16.py --json results/benchmarks/bf16.json
 """
@@ -10,126 +11,128 @@ a processor with AVX512-BF16.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import tempfile
-from pathlib import Path
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
-from common import machine, write
+import torch
+from common import machine, synthetic, write
 
-SOURCE = r"""
-#include <immintrin.h>
-#include <algorithm>
-#include <cstdint>
-#include <cstdio>
-#include <cstdlib>
-#include <ctime>
+import offbeat as ob
+from offbeat import kernels
+from offbeat.captured import products
+from offbeat.kernels import cpu
+from offbeat.models.zoo import recipe_of
+from offbeat.run import FlatParameters, RunState
+from offbeat.training import Examples, train_step
 
-constexpr int LANES = 32, LAYERS = 8;
+SIZES = ((15, 100, 50), (64, 128, 512), (64, 256, 512), (256, 256, 512), (256, 512, 512),
+         (256, 256, 4096))  # fmt: skip
+"""Hidden units, units of each of the four layers of the vector field, trajectories."""
 
-__attribute__((noinline)) void layer(int n, const float* w, const float* x, float* y) {
-  for (int o = 0; o < n; o += 4) {
-    __m512 sum[4][2];
-    for (auto& r : sum) r[0] = r[1] = _mm512_setzero_ps();
-    for (int k = 0; k < n; ++k) {
-      const __m512 a = _mm512_loadu_ps(x + k * LANES), b = _mm512_loadu_ps(x + k * LANES + 16);
-      for (int r = 0; r < 4; ++r) {
-        const __m512 each = _mm512_set1_ps(w[o * n + k * 4 + r]);
-        sum[r][0] = _mm512_fmadd_ps(each, a, sum[r][0]);
-        sum[r][1] = _mm512_fmadd_ps(each, b, sum[r][1]);
-      }
-    }
-    for (int r = 0; r < 4; ++r)
-      for (int v = 0; v < 2; ++v) _mm512_storeu_ps(y + (o + r) * LANES + 16 * v, sum[r][v]);
-  }
-}
-// Weights and x in pairs of inputs.
-__attribute__((noinline)) void layer(int n, const uint32_t* w, const uint32_t* x, float* y) {
-  for (int o = 0; o < n; o += 4) {
-    __m512 sum[4][2];
-    for (auto& r : sum) r[0] = r[1] = _mm512_setzero_ps();
-    for (int k = 0; k < n / 2; ++k) {
-      const __m512bh a = (__m512bh)_mm512_loadu_si512(x + k * LANES);
-      const __m512bh b = (__m512bh)_mm512_loadu_si512(x + k * LANES + 16);
-      for (int r = 0; r < 4; ++r) {
-        const __m512bh each = (__m512bh)_mm512_set1_epi32(w[o * n / 2 + k * 4 + r]);
-        sum[r][0] = _mm512_dpbf16_ps(sum[r][0], each, a);
-        sum[r][1] = _mm512_dpbf16_ps(sum[r][1], each, b);
-      }
-    }
-    for (int r = 0; r < 4; ++r)
-      for (int v = 0; v < 2; ++v) _mm512_storeu_ps(y + (o + r) * LANES + 16 * v, sum[r][v]);
-  }
-}
-__attribute__((noinline)) void round_pairs(int n, const float* x, uint32_t* to) {
-  for (int k = 0; k < n; k += 2)
-    for (int v = 0; v < LANES; v += 16) {
-      const __m512i both = (__m512i)_mm512_cvtne2ps_pbh(
-          _mm512_loadu_ps(x + (k + 1) * LANES + v), _mm512_loadu_ps(x + k * LANES + v));
-      const __m512i low = _mm512_cvtepu16_epi32(_mm512_castsi512_si256(both));
-      const __m512i high = _mm512_cvtepu16_epi32(_mm512_extracti64x4_epi64(both, 1));
-      _mm512_storeu_si512(to + k / 2 * LANES + v,
-                          _mm512_or_si512(low, _mm512_slli_epi32(high, 16)));
-    }
-}
-double now() {
-  timespec t;
-  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &t);
-  return t.tv_sec * 1e9 + t.tv_nsec;
-}
-template <class F>
-double turn(F one) {
-  const double start = now();
-  for (int i = 0; i < 5 * LAYERS; ++i) one(i % LAYERS);
-  return (now() - start) / (5 * LAYERS);
-}
-int main(int, char** argv) {
-  const int n = atoi(argv[1]), turns = atoi(argv[2]);
-  auto* w = (float*)aligned_alloc(64, 4L * LAYERS * n * n);
-  auto* pairs = (uint32_t*)aligned_alloc(64, 2L * LAYERS * n * n);
-  auto* x = (float*)aligned_alloc(64, 4L * n * LANES);
-  auto* rounded = (uint32_t*)aligned_alloc(64, 2L * n * LANES);
-  auto* y = (float*)aligned_alloc(64, 4L * n * LANES);
-  for (long i = 0; i < long(LAYERS) * n * n; ++i) w[i] = 0.01f;
-  for (long i = 0; i < long(LAYERS) * n * n / 2; ++i) pairs[i] = 0x3c243c24;
-  for (int i = 0; i < n * LANES; ++i) x[i] = 0.1f;
-  double single = 1e30, half = 1e30;
-  for (int i = 0; i < turns; ++i) {
-    single = std::min(single, turn([&](int l) { layer(n, w + long(l) * n * n, x, y); }));
-    half = std::min(half, turn([&](int l) {
-      round_pairs(n, x, rounded);
-      layer(n, pairs + long(l) * n * n / 2, rounded, y);
-    }));
-  }
-  printf("{\"float32_ns\": %.0f, \"bf16_ns\": %.0f, \"ratio\": %.2f}\n", single, half,
-         single / half);
-}
-"""
+
+def step_of(
+    backend: str, precision: str, size: tuple[int, int, int], rows: int
+) -> Callable[[], Any]:
+    """A training step; returns its loss."""
+    hidden, units, batch = size
+    data = synthetic(batch, rows, observed_fraction=0.3)
+    config = ob.thesis_config("ode_gru_d", hidden_size=hidden, field_units=(units,) * 4)
+    model = ob.make_model(config, data, seed=0)
+    examples = Examples(model, model.batch(data))
+    config = ob.TrainConfig(precision=precision)  # type: ignore[arg-type]
+    recipe = recipe_of(model.name, config, validated=False)
+    state = RunState(FlatParameters(model), recipe)
+    index = torch.arange(len(examples))
+
+    def step() -> float:
+        with ExitStack() as stack:
+            stack.enter_context(kernels.use(backend))
+            stack.enter_context(model.threads())
+            stack.enter_context(products(model, precision))
+            return train_step(model, examples, index, state, recipe, total=1)
+
+    return step
+
+
+def times_of(size: tuple[int, int, int], rows: int, repeats: int) -> dict[str, Any]:
+    """Processor time of a step of each way, ms."""
+    ways = {"float32": ("cpu", "float32")}
+    ways |= {name: (name, "bf16") for name in cpu.bf16_sets()}
+    ways |= {"reference float32": ("reference", "float32"),
+             "reference autocast": ("reference", "bf16")}  # fmt: skip
+    steps = {name: step_of(*way, size, rows) for name, way in ways.items()}
+    first = {name: step() for name, step in steps.items()}
+    for name, loss in first.items():
+        if abs(loss - first["reference float32"]) > 1e-2 * abs(loss):
+            raise SystemExit(f"{name} computes the loss {loss}, others {first}")
+    taken: dict[str, list[float]] = {name: [] for name in steps}
+    for _ in range(repeats):
+        for name, step in steps.items():
+            start = time.process_time()
+            step()
+            taken[name].append(1e3 * (time.process_time() - start))
+    found = {}
+    for name, each in taken.items():
+        ratios = [a / b for a, b in zip(taken["float32"], each, strict=True)]
+        found[name] = {
+            "median_ms": round(statistics.median(each), 1),
+            "fastest_ms": round(min(each), 1),
+            "times_as_fast_as_float32": round(statistics.median(ratios), 2),
+        }
+    return found
+
+
+def scores(seeds: int, epochs: int) -> list[dict[str, float]]:
+    """Validation MSE after the same training in both precisions, for each seed."""
+    found = []
+    for seed in range(seeds):
+        recorded = ob.simulate("hopper", 300, 100, seed=seed)
+        data = ob.mask_out(recorded, 0.7, seed=seed)
+        train, validation = data[:200], data[200:]
+        one: dict[str, float] = {"seed": seed}
+        for precision in ("float32", "bf16"):
+            config = ob.thesis_config("ode_gru_d", hidden_size=64, field_units=(128,) * 4)
+            model = ob.make_model(config, train, seed=seed)
+            asked = ob.TrainConfig(epochs=epochs, seed=seed, precision=precision)  # type: ignore[arg-type]
+            result = ob.fit(model, train, validation, config=asked, progress=False)
+            one[precision] = min(record.validation_mse for record in result.history)
+            one[f"{precision}, first epoch"] = result.history[0].validation_mse
+        found.append(one)
+        print(one, flush=True)
+    return found
 
 
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("--units", type=int, nargs="+", default=[64, 128, 256])
-    parser.add_argument("--repeats", type=int, default=60)
+    parser.add_argument("--rows", type=int, default=50)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--epochs", type=int, default=30)
+    parser.add_argument("--only", choices=["steps", "training"])
     parser.add_argument("--json")
     options = parser.parse_args()
-    if "avx512_bf16" not in Path("/proc/cpuinfo").read_text():
+    if not cpu.bf16_sets():
         raise SystemExit("this processor has no AVX512-BF16 (avx512_bf16 in /proc/cpuinfo)")
-    found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        source, program = Path(folder) / "bf16.cpp", Path(folder) / "bf16"
-        source.write_text(SOURCE)
-        flags = ["-mavx512f", "-mavx512bf16", "-mavx512vl", "-mavx512dq", "-mavx512bw", "-mfma"]
-        command = ["c++", "-O3", "-std=c++17", *flags, str(source), "-o", str(program)]
-        subprocess.run(command, check=True)
-        for units in options.units:
-            command = [str(program), str(units), str(options.repeats)]
-            done = subprocess.run(command, capture_output=True, check=True, text=True)
-            found[str(units)] = json.loads(done.stdout)
-            print(f"{units:4} units, 32 trajectories: {done.stdout.strip()}", flush=True)
-    write(options.json, {"machine": machine(), "options": vars(options), "layers": found})
+    torch.set_num_threads(1)
+    found: dict[str, Any] = {"machine": machine(), "options": vars(options)}
+    if options.only != "training":
+        found["steps"] = {}
+        for size in SIZES:
+            few = options.repeats * (4 if size[2] < 100 else 1)
+            name = "hidden {}, units {}, batch {}".format(*size)
+            found["steps"][name] = times_of(size, options.rows, few)
+            print(name, found["steps"][name], flush=True)
+    if options.only != "steps":
+        each = found["training"] = scores(options.seeds, options.epochs)
+        ratios = [one["bf16"] / one["float32"] for one in each]
+        found["ratio of validation MSE"] = {"median": statistics.median(ratios),
+                                            "least": min(ratios), "most": max(ratios)}  # fmt: skip
+        print(found["ratio of validation MSE"])
+    write(options.json, found)
 
 
 if __name__ == "__main__":

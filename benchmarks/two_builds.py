@@ -22,6 +22,7 @@ MODELS = ("ode_rnn", "ode_gru_d", "anchored_ode_gru_d", "gru", "gru_d")
 
 WORKER = """
 import json, sys, time
+from dataclasses import replace
 import numpy as np
 import torch
 import offbeat as ob
@@ -44,6 +45,9 @@ for line in sys.stdin:
     name = line.strip()
     thesis = name in ob.THESIS_MODELS
     config = ob.thesis_config(name) if thesis else ob.ModelConfig(name=name)
+    if options["units"]:
+        units = (options["units"],) * 4
+        config = replace(config, hidden_size=options["hidden"], field_units=units)
     make = ob.make_model if hasattr(ob, "make_model") else ob.make  # 0.1.0
     model = make(config, data, seed=0)
     training = ob.train_config(name, epochs=1, batch_size=options["batch"])
@@ -89,6 +93,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batch", type=int, default=50)
     parser.add_argument("--rows", type=int, default=100)
+    parser.add_argument("--hidden", type=int, default=15, help="units, with --units")
+    parser.add_argument("--units", type=int, help="of each of four layers of the vector field")
     parser.add_argument("--steps", type=int, default=8, help="training steps per turn")
     parser.add_argument("--turns", type=int, default=15)
     parser.add_argument(
@@ -100,7 +106,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     load = os.getloadavg()[0]
-    names = ("threads", "batch", "rows", "steps", "clock")
+    names = ("threads", "batch", "rows", "hidden", "units", "steps", "clock")
     sizes = {name: getattr(options, name) for name in names}
     both = [Checkout(root, sizes) for root in options.checkouts]
     for checkout in both:

@@ -81,6 +81,31 @@ def test_a_module_without_squares_gives_the_same_bits(monkeypatch: pytest.Monkey
     assert torch.equal(found[0][1], found[1][1])
 
 
+def test_activations_that_are_kept_or_computed_again_give_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Batches of several sizes share the memory of the largest one."""
+    recipe = recipe_of("ode_rnn", ob.TrainConfig(), validated=False)
+    sizes, found = [], []
+
+    def watched(*args: Any, **options: Any) -> int | None:
+        sizes.append(size := tape_size(*args, **options))
+        return size
+
+    tape_size = kernels.cpu.tape_size
+    monkeypatch.setattr(kernels.cpu, "tape_size", watched)
+    for limit, kept in ((0, 0), (0, 2**29), (2**25, 0)):
+        monkeypatch.setattr(kernels.cpu, "TAPE_LIMIT", limit)
+        monkeypatch.setattr(kernels.cpu, "KEPT_TAPE_LIMIT", kept)
+        found.append(trained(MODELS["ode_rnn"], recipe, autograd=False))
+    n = len(BATCHES)
+    assert sizes[:n] == [None] * n
+    assert None not in sizes[n:]
+    for losses, weights in found[1:]:
+        assert losses == found[0][0]
+        assert torch.equal(weights, found[0][1])
+
+
 def test_a_whole_training_has_the_bits_of_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
     data = ob.mask_out(dataset(12), 0.6, seed=0)
     train, validation = data[:9], data[9:]

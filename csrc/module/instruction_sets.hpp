@@ -37,5 +37,6 @@ const Kernels<float>& typed(const InstructionSet& b) {
 }
 template <>
 const Kernels<double>& typed(const InstructionSet& b) {
+  if (!b.f64.width) refuse(std::string("the instruction set ") + b.name + " has float32 alone");
   return b.f64;
 }

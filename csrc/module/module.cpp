@@ -8,6 +8,10 @@
 #include <nanobind/stl/vector.h>
 
 #include <unistd.h>
+#ifdef OFFBEAT_BF16
+#include <cpuid.h>
+#include <sys/syscall.h>
+#endif
 
 #include <algorithm>
 #include <atomic>
@@ -36,6 +40,9 @@ extern const InstructionSet kernels_baseline;
 #ifdef OFFBEAT_X86
 extern const InstructionSet kernels_avx2;
 extern const InstructionSet kernels_avx512;
+#ifdef OFFBEAT_BF16
+extern const InstructionSet kernels_avx512_bf16, kernels_amx_bf16;
+#endif
 #endif
 
 namespace {
@@ -49,6 +56,7 @@ using Maybe = std::optional<Const<T>>;
 
 #include "arguments.hpp"
 #include "instruction_sets.hpp"
+#include "bf16_sets.hpp"
 #include "threads.hpp"
 #include "step_inputs.hpp"
 #include "batch.hpp"
@@ -122,7 +130,7 @@ void bind(nb::module_& m, const char* suffix) {
   m.def(
       "tape_size",
       [](const Spec& s, const std::string& set, const StepInputs<T>& inputs, Const<T> state) {
-        return tape_size<T>(s, find_instruction_set(set), inputs, state);
+        return tape_size<T>(s, find_set(set), inputs, state);
       },
       nb::arg("spec"), nb::arg("instruction_set"), nb::arg("inputs"), nb::arg("state").noconvert());
   m.def(
@@ -130,7 +138,7 @@ void bind(nb::module_& m, const char* suffix) {
       [](const Spec& s, const std::string& set, Const<T> weights, const StepInputs<T>& inputs,
          Const<T> state, Array<T> before, Array<T> after, std::optional<Array<T>> tape,
          int threads) {
-        scan_forward<T>(s, find_instruction_set(set), weights, inputs, state, before, after, tape,
+        scan_forward<T>(s, find_set(set), weights, inputs, state, before, after, tape,
                         threads);
       },
       nb::arg("spec"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
@@ -142,7 +150,7 @@ void bind(nb::module_& m, const char* suffix) {
          Const<T> state, Const<T> after, std::optional<Const<T>> tape,
          std::optional<Const<T>> to_before, std::optional<Const<T>> to_after, Array<T> to_weights,
          Array<T> to_state, int threads, int group) {
-        scan_backward<T>(s, find_instruction_set(set), weights, inputs, state, after, tape,
+        scan_backward<T>(s, find_set(set), weights, inputs, state, after, tape,
                          to_before, to_after, to_weights, to_state, threads, group);
       },
       nb::arg("spec"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
@@ -152,13 +160,13 @@ void bind(nb::module_& m, const char* suffix) {
       nb::arg("to_state").noconvert(), nb::arg("threads"), nb::arg("group") = 0);
   m.def(("perceptron_tape_" + end).c_str(),
         [](const Perceptron& p, const std::string& set, int64_t rows) {
-          return perceptron_tape<T>(p, find_instruction_set(set), rows);
+          return perceptron_tape<T>(p, find_set(set), rows);
         });
   m.def(
       "perceptron_forward",
       [](const Perceptron& p, const std::string& set, Const<T> weights, Const<T> x, Array<T> y,
          std::optional<Array<T>> tape, int threads) {
-        perceptron_forward<T>(p, find_instruction_set(set), weights, x, y, tape, threads);
+        perceptron_forward<T>(p, find_set(set), weights, x, y, tape, threads);
       },
       nb::arg("shape"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
       nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("tape").noconvert().none(),
@@ -167,7 +175,7 @@ void bind(nb::module_& m, const char* suffix) {
       "perceptron_backward",
       [](const Perceptron& p, const std::string& set, Const<T> weights, Const<T> x, Const<T> tape,
          Const<T> to_y, Array<T> to_weights, std::optional<Array<T>> to_x, int threads) {
-        perceptron_backward<T>(p, find_instruction_set(set), weights, x, tape, to_y, to_weights,
+        perceptron_backward<T>(p, find_set(set), weights, x, tape, to_y, to_weights,
                                to_x, threads);
       },
       nb::arg("shape"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
@@ -179,7 +187,7 @@ void bind(nb::module_& m, const char* suffix) {
          Maybe<T> first, int64_t column, Const<T> targets, Const<int64_t> index, double norm,
          double scale, Array<T> squares, Array<T> to_weights, Array<T> to_states,
          int threads) {
-        perceptron_squares<T>(p, find_instruction_set(set), weights, states, first, column, targets,
+        perceptron_squares<T>(p, find_set(set), weights, states, first, column, targets,
                               index, norm, scale, squares, to_weights, to_states, threads);
       },
       nb::arg("shape"), nb::arg("instruction_set"), nb::arg("weights").noconvert(),
@@ -200,7 +208,7 @@ void bind(nb::module_& m, const char* suffix) {
       "adamax",
       [](const std::string& set, Const<T> gradient, double lerp, double beta, double eps,
          double step, Array<T> average, Array<T> largest, Array<T> weights) {
-        adamax<T>(find_instruction_set(set), gradient, lerp, beta, eps, step, average, largest,
+        adamax<T>(find_set(set), gradient, lerp, beta, eps, step, average, largest,
                   weights);
       },
       nb::arg("instruction_set"), nb::arg("gradient").noconvert(), nb::arg("lerp"),
@@ -246,7 +254,12 @@ NB_MODULE(_cpu, m) {
     for (const InstructionSet* set : instruction_sets()) names.emplace_back(set->name);
     return names;
   });
-  m.def("width", [](const std::string& set) { return find_instruction_set(set).f32.width; });
+  m.def("bf16_sets", [] {
+    std::vector<std::string> names;
+    for (const InstructionSet* set : bf16_sets()) names.emplace_back(set->name);
+    return names;
+  });
+  m.def("width", [](const std::string& set) { return find_set(set).f32.width; });
   nb::class_<Spec>(m, "Spec")
       .def(
           "__init__",

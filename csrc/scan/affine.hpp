@@ -56,8 +56,9 @@ static INLINE void panels(const T* w, const T* bias, int rows, int in, const T* 
         store<T>(y + r * W + v * VW, finish(acc[r][v], at + r * W + v * VW));
 }
 
-// Two vectors of lanes have enough sums in one panel; one vector takes half of the registers, of
-// which AVX-512 has 32 and the others 16.
+// Two vectors of lanes have enough sums in one panel, but for long ones with the 32 registers of
+// AVX-512; one vector takes half of the registers.
+static constexpr int LONG_SUM = 128;
 template <int NV>
 static constexpr int panels_at_once() {
   return NV > 1 ? 1 : (VECTOR_BYTES == 64 ? 32 : 16) / 2 / TILE;
@@ -152,27 +153,33 @@ struct Many {
   static int pad(int n) { return n; }
   template <bool ACCUMULATE>
   static NOINLINE void affine(const Matrix& m, const T* packed, int lanes, const T* x, T* y) {
-    product<ACCUMULATE>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out,
-                        m.in, lanes, x, y, Plain{});
+    product<ACCUMULATE>(m.half, packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr,
+                        m.out, m.in, lanes, x, y, Plain{});
   }
   static NOINLINE void tanh_affine(const Matrix& m, const T* packed, int lanes, const T* x, T* y) {
-    product<false>(packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr, m.out, m.in,
-                   lanes, x, y, Tanh{y});
+    product<false>(m.half, packed + m.panels, m.bias >= 0 ? packed + m.packed_bias : nullptr,
+                   m.out, m.in, lanes, x, y, Tanh{y});
   }
   // x[k] (+)= sum over o of w[o][k] y[o]
   template <bool ACCUMULATE>
   static NOINLINE void transposed(const Matrix& m, const T* packed, int lanes, const T* y, T* x) {
-    product<ACCUMULATE>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x, Plain{});
+    product<ACCUMULATE>(m.half, packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
+                        Plain{});
   }
   // The same, times the derivative of tanh where the value of tanh is `value`.
   static NOINLINE void through_tanh(const Matrix& m, const T* packed, int lanes, const T* y,
                                     const T* value, T* x) {
-    product<false>(packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
+    product<false>(m.half, packed + m.transposed, nullptr, m.backward_in, m.out, lanes, y, x,
                    TimesTanhSlope{value});
   }
   template <bool ACCUMULATE, class Finish>
-  static INLINE void product(const T* w, const T* bias, int out, int in, int lanes, const T* x,
-                             T* y, const Finish& finish) {
+  static INLINE void product(bool half, const T* w, const T* bias, int out, int in, int lanes,
+                             const T* x, T* y, const Finish& finish) {
+#if BF16
+    if (half) return half_product<NV, ACCUMULATE>(w, bias, out, in, x, y, finish);
+#else
+    (void)half;
+#endif
     if constexpr (sizeof(T) == 4) {  // the last vector may have few lanes
       constexpr int FULL = (NV - 1) * VW;
       const int n = lanes - FULL;
@@ -193,6 +200,10 @@ struct Many {
                            const Finish& finish) {
     constexpr int P = panels_at_once<N>(), R = P * TILE;
     int o = 0;
+    if (N > 1 && VECTOR_BYTES == 64 && in >= LONG_SUM)
+      for (; o + 2 * TILE <= out; o += 2 * TILE)
+        panels<2, N, W, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, 2 * TILE, in, x,
+                                    y, int64_t(o) * W, finish);
     for (; P > 1 && o + R <= out; o += R)
       panels<P, N, W, ACCUMULATE>(w + int64_t(o) * in, bias ? bias + o : nullptr, R, in, x, y,
                                   int64_t(o) * W, finish);

@@ -318,13 +318,6 @@ static NOINLINE void prefetch(const T* p, int64_t n) {
   for (int64_t i = 0; i < n; i += 64 / int(sizeof(T))) __builtin_prefetch(p + i, 0, 2);
 }
 
-static int widest_input(const Map& map) {
-  int n = 0;
-  for (int i = 0; i < M_END; ++i)
-    if (map.used[i] && up(map.m[i].in, VW) > n) n = up(map.m[i].in, VW);
-  return n;
-}
-
 static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
   using P = Many<2>;
   const Map p = map(s);
@@ -333,7 +326,7 @@ static int64_t backward_scratch(const Spec& s, int max_steps, int group) {
                           int64_t(gradient_layout(s, d, max_steps).size) * P::W;
   return per_row * group + work_size<P>(s) + int64_t(widest<P>(s)) * P::W + int64_t(d.S) * P::W +
          int64_t(d.H + (d.C > d.H ? d.C : d.H) + d.D * (s.stages + 1) + d.S) * P::W +
-         range_size(s, d) + int64_t(PAIRS_AT_ONCE) * P::W * widest_input(p) + 64;
+         range_size(s, d) + outer_scratch(p, P::W) + 64;
 }
 
 template <class P>
@@ -360,7 +353,7 @@ static void block_backward(const Job<T>& job, const Block& b, int begin, int end
   T* to_values = take((d.C > d.H ? d.C : d.H) * W);
   T* stage_gradients = take(int64_t(d.D) * (s.stages + 1) * W);
   T* to_node = take(d.S * W);
-  T* xt = take(int64_t(PAIRS_AT_ONCE) * W * widest_input(p));
+  T* xt = take(outer_scratch(p, P::W));
   Back<P> k{c, places, pairs, sums, xt, z, to_values, stage_gradients, to_node};
   T* lanes = take(inputs_size * job.group);
   T* gradients = take(slot_size * job.group);

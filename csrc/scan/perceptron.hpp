@@ -30,7 +30,7 @@ static int64_t perceptron_scratch(const Perceptron& shape) {
   const int wide = up(perceptron_widest(shape), VW);
   return perceptron_tape_row(shape) +
          int64_t(PERCEPTRON_GROUP) * (int64_t(gradients) * P::W + perceptron_tape_row(shape)) +
-         int64_t(2 * wide) * P::W + int64_t(PAIRS_AT_ONCE) * P::W * wide + 64;
+         int64_t(2 * wide) * P::W + outer_scratch(perceptron_map(shape), P::W) + 64;
 }
 static constexpr int PERCEPTRON_GROUP = 4;
 
@@ -131,7 +131,7 @@ static void perceptron_backward(const PerceptronJob<T>& job, int slot, T* scratc
   T* z = scratch;
   T* to_x = z + int64_t(wide) * P::W;
   T* xt = to_x + int64_t(wide) * P::W;
-  T* own = xt + int64_t(PAIRS_AT_ONCE) * P::W * wide;
+  T* own = xt + outer_scratch(p, P::W);
   T* tapes = own + int64_t(PERCEPTRON_GROUP) * gradients * P::W;
   T* sums = job.sums + slot * p.sums;
   zero(sums, p.sums);

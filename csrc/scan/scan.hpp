@@ -10,6 +10,11 @@
 // The sums of each lane run over the inputs in order, both in a batch ([unit][lane], vectors over
 // lanes) and in a stream ([unit], vectors over outputs). The results are equal bit for bit.
 
+// Instruction sets that compute products in bfloat16 define BF16 and, with AMX, BF16_AMX.
+#ifndef BF16
+#define BF16 0
+#endif
+
 template <class T>
 struct Scan {
   using V = typename Lanes<T>::V;
@@ -21,6 +26,9 @@ struct Scan {
 
 #include "weights.hpp"
 #include "affine.hpp"
+#if BF16
+#include "bf16.hpp"
+#endif
 #include "layout.hpp"
 #include "forward.hpp"
 #include "weight_gradients.hpp"

@@ -50,12 +50,30 @@ static void transpose(const T* x, int units, int padded, int W, int lanes, T* xt
   units_to_lanes(x, units, lanes, W, to);
 }
 
+// Numbers of scratch memory, `xt`, that `add_pairs` needs.
+static int64_t outer_scratch(const Matrix& m, int W) {
+  const int64_t some = PAIRS_AT_ONCE;
+  return m.half ? some * 16 * (up(m.out, 16) + up(m.in, 16)) : some * W * up(m.in, VW);
+}
+static int64_t outer_scratch(const Map& map, int W) {
+  int64_t n = 0;
+  for (int i = 0; i < M_END; ++i)
+    if (map.used[i] && outer_scratch(map.m[i], W) > n) n = outer_scratch(map.m[i], W);
+  return n;
+}
+
 static NOINLINE void add_pairs(const Matrix& m, int pairs, int W, int lanes, const T* const* to_out,
                                const T* const* x, T* sums, T* xt) {
   const int in = up(m.in, VW);
   T* sum = sums + m.sum;
   for (int first = 0; first < pairs; first += PAIRS_AT_ONCE) {
     const int n = pairs - first < PAIRS_AT_ONCE ? pairs - first : PAIRS_AT_ONCE;
+#if BF16
+    if (m.half) {
+      add_half_pairs(m, n, W, lanes, to_out + first, x + first, sum, xt);
+      continue;
+    }
+#endif
     for (int e = 0; e < n; ++e)
       transpose(x[first + e], m.in, in, W, lanes, xt + int64_t(e) * lanes * in);
     for (int i = 0; i < in;) {  // strips of three or four vectors, then of two or one
@@ -96,8 +114,13 @@ static void flush(const Map& map, Pairs& pairs, int W, int lanes, T* sums, T* xt
 static void reduce_matrix(const Matrix& m, const T* sums, T* flat) {
   const int in = up(m.in, VW);
   for (int o = 0; o < m.out; ++o)
-    for (int k = 0; k < m.in; ++k)
-      flat[m.weight + int64_t(o) * m.in + k] += sums[m.sum + int64_t(o) * in + k];
+    for (int k = 0; k < m.in; ++k) {
+      int64_t at = int64_t(o) * in + k;
+#if BF16
+      if (m.half) at = sum_place(o, k, in);
+#endif
+      flat[m.weight + int64_t(o) * m.in + k] += sums[m.sum + at];
+    }
   if (m.bias >= 0) reduce_lanes(sums + m.bias_sum, m.out, flat + m.bias);
 }
 static void reduce_lanes(const T* sums, int units, T* flat) {

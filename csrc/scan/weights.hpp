@@ -38,7 +38,7 @@ enum {
 struct Matrix {
   int out = 0, in = 0;
   int64_t weight = -1, bias = -1;  // in the flat buffer; -1: none
-  bool backward = false;
+  bool backward = false, half = false;  // half: products in bfloat16 (bf16.hpp)
   int backward_in = 0;                                  // leading inputs that need a gradient
   int64_t panels = 0, transposed = 0, packed_bias = 0;  // in the packed buffer of batches
   int64_t sum = 0, bias_sum = 0;                        // in the sums of a slot
@@ -62,6 +62,11 @@ struct Map {
 };
 
 static constexpr int TILE = 4;
+
+// Numbers of the weights of a product, with their padding.
+static int64_t panels_size(const Matrix& m, int out, int in) {
+  return m.half ? int64_t(up(out, 16)) * up(in, 32) / 2 : int64_t(up(out, TILE)) * in;
+}
 
 static void segments(Matrix& m, int n, int each) {
   m.splits = n;
@@ -124,10 +129,12 @@ static NOINLINE Map map(const Spec& s) {
   for (int i = 0; i < M_END; ++i) {
     if (!p.used[i]) continue;
     Matrix& m = p.m[i];
-    m.panels = packed, packed += int64_t(up(m.out, TILE)) * m.in;
-    if (m.backward) m.transposed = packed, packed += int64_t(up(m.backward_in, TILE)) * m.out;
+    m.half = BF16 && i != M_DECAY;  // its inputs are times
+    if (m.half) packed = (packed + 15) / 16 * 16;
+    m.panels = packed, packed += panels_size(m, m.out, m.in);
+    if (m.backward) m.transposed = packed, packed += panels_size(m, m.backward_in, m.out);
     if (m.bias >= 0) m.packed_bias = packed, packed += up(m.out, TILE);
-    m.sum = sums, sums += int64_t(m.out) * up(m.in, VW);
+    m.sum = sums, sums += int64_t(m.half ? up(m.out, 16) : m.out) * up(m.in, VW);
     if (m.bias >= 0) m.bias_sum = sums, sums += int64_t(m.out) * VW;
     m.padded_out = 0;
     for (int k = 0; k < m.splits; ++k) m.padded_out += up(m.split[k], VW);
@@ -154,21 +161,36 @@ static int64_t packed_size(const Spec& s) { return map(s).packed; }
 static int64_t sums_size(const Spec& s) { return map(s).sums; }
 static int64_t stream_packed_size(const Spec& s) { return map(s).stream; }
 
-static void pack_matrix(const Matrix& m, const T* flat, T* packed) {
-  const T* w = flat + m.weight;
+static void pack_panels(const Matrix& m, const T* w, T* packed) {
   T* p = packed + m.panels;
   for (int o = 0; o < m.out; o += TILE)
     for (int k = 0; k < m.in; ++k)
       for (int r = 0; r < TILE; ++r) *p++ = o + r < m.out ? w[int64_t(o + r) * m.in + k] : T(0);
-  if (m.backward) {
-    p = packed + m.transposed;
-    for (int i = 0; i < m.backward_in; i += TILE)
-      for (int o = 0; o < m.out; ++o)
-        for (int r = 0; r < TILE; ++r)
-          *p++ = i + r < m.backward_in ? w[int64_t(o) * m.in + i + r] : T(0);
-  }
+  if (!m.backward) return;
+  p = packed + m.transposed;
+  for (int i = 0; i < m.backward_in; i += TILE)
+    for (int o = 0; o < m.out; ++o)
+      for (int r = 0; r < TILE; ++r)
+        *p++ = i + r < m.backward_in ? w[int64_t(o) * m.in + i + r] : T(0);
+}
+static void pack_halves(const Matrix& m, const T* w, T* packed) {
+#if BF16
+  pack_tiles(m.out, m.in, packed + m.panels,
+             [&](int o, int i) { return w[int64_t(o) * m.in + i]; });
+  if (m.backward)
+    pack_tiles(m.backward_in, m.out, packed + m.transposed,
+               [&](int i, int o) { return w[int64_t(o) * m.in + i]; });
+#else
+  (void)m, (void)w, (void)packed;
+#endif
+}
+static void pack_matrix(const Matrix& m, const T* flat, T* packed) {
+  if (m.half)
+    pack_halves(m, flat + m.weight, packed);
+  else
+    pack_panels(m, flat + m.weight, packed);
   if (m.bias >= 0) {
-    p = packed + m.packed_bias;
+    T* p = packed + m.packed_bias;
     for (int o = 0; o < up(m.out, TILE); ++o) p[o] = o < m.out ? flat[m.bias + o] : T(0);
   }
 }

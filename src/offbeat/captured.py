@@ -1,4 +1,4 @@
-"""Training steps on a GPU: a whole step in one CUDA graph, and precisions of its products.
+"""Training steps on a GPU: a whole step in one CUDA graph; and precisions of products.
 
 A step of the reference backend is thousands of small kernels, each of which the CPU has to launch.
 A CUDA graph records them once, forward pass, backward pass and optimizer, and starts them together.
@@ -15,6 +15,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,8 +24,8 @@ from offbeat.config import Recipe
 from offbeat.distributed import current
 from offbeat.errors import InputError
 from offbeat.examples import Examples
-from offbeat.kernels import StepTable, choose
-from offbeat.kernels.backends import REFERENCE
+from offbeat.kernels import StepTable, choose, cpu, use
+from offbeat.kernels.backends import REFERENCE, selected
 from offbeat.models.base import BaseModel
 from offbeat.models.model import Model
 from offbeat.ode import tableau
@@ -185,15 +186,20 @@ def captured(
     return None
 
 
-def autocast(model: BaseModel, name: str) -> AbstractContextManager[None]:
+def autocast(model: BaseModel, name: str) -> AbstractContextManager[Any]:
     """Context manager of the forward pass in a precision; see `TrainConfig.precision`.
 
     Args:
         model: that is trained.
         name: one of `PRECISIONS`.
+
+    Raises:
+        InputError: the model cannot be trained in it, see `check_precision`.
     """
     if name != "bf16":
         return nullcontext()
+    if _compiled(model):
+        return use(_bf16_set())
     # Without the cache of casts, which a graph would not fill again.
     return torch.autocast(model.device.type, dtype=torch.bfloat16, cache_enabled=False)
 
@@ -202,12 +208,15 @@ def autocast(model: BaseModel, name: str) -> AbstractContextManager[None]:
 def products(model: BaseModel, name: str) -> Iterator[None]:
     """Context manager of training steps: TF32 is on where it is the precision, and off elsewhere.
 
+    On the CPU, `bf16` selects the instruction set of the compiled backend.
+
     Args:
         model: that is trained.
         name: one of `PRECISIONS`.
     """
     if model.device.type != "cuda":
-        yield
+        with use(_bf16_set()) if name == "bf16" and _compiled(model) else nullcontext():
+            yield
         return
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if name == "tf32" else "highest")
@@ -225,11 +234,43 @@ def check_precision(model: BaseModel, name: str) -> None:
         name: one of `PRECISIONS`.
 
     Raises:
-        InputError: the compiled backend of the CPU would run it, which has float32 alone.
+        InputError: the compiled backend of the CPU would run it, and has no products in this
+            precision for this processor, the selected instruction set or the model's numbers.
     """
-    on_cpu = model.device.type == "cpu"
-    if name != "float32" and on_cpu and model.backend()[0] not in (REFERENCE, "torch"):
+    if name == "float32" or not _compiled(model):
+        return
+    if name != "bf16":
         raise InputError(
             f"precision {name!r} is one of GPUs: on the CPU the backend {model.backend()[0]} "
-            "computes in float32; leave precision out, or give device cuda"
+            "computes in float32 or bf16; leave precision out, or give device cuda"
         )
+    if model.dtype != torch.float32:
+        raise InputError(
+            f"precision 'bf16' is for models in float32, but this one is in {model.dtype}; leave "
+            "precision out"
+        )
+    _bf16_set()
+
+
+def _compiled(model: BaseModel) -> bool:
+    """Whether the compiled backend of the CPU runs a model."""
+    return model.device.type == "cpu" and model.backend()[0] not in (REFERENCE, "torch")
+
+
+def _bf16_set() -> str:
+    """The instruction set for products in bfloat16: the best, or the one that is selected."""
+    name, where = selected()
+    sets = cpu.bf16_sets()
+    if not sets:
+        raise InputError(
+            "precision 'bf16' needs a processor with AVX512-BF16 (avx512_bf16), and Linux; leave "
+            "precision out, or give device cuda"
+        )
+    if name in sets:
+        return name
+    if name not in ("auto", "cpu"):
+        raise InputError(
+            f"precision 'bf16' runs in {' or '.join(sets)}, but {where} selects {name}; leave one "
+            "of the two out"
+        )
+    return sets[0]

@@ -368,9 +368,11 @@ class TrainConfig:
             those of the best baseline for the channel and the time since its last observation.
             With it, or with tasks, `patience` and `keep` go by the validation score, the mean
             logarithm of the ratio of the MSE to that of the best baseline.
-        precision: of the products of a step on a GPU. `float32` is that of IEEE; `tf32` rounds
-            what is multiplied to 10 bits; `bf16` computes them in bfloat16 (autocast). Weights,
-            the optimizer, times and the validation stay as they are.
+        precision: of the products of weights and activations in a step. `float32` is that of
+            IEEE; `tf32` rounds what is multiplied to 10 bits, on a GPU; `bf16` to 7 bits, on a
+            GPU by autocast, on the CPU in the compiled backend where the processor has
+            AVX512-BF16 or AMX (`offbeat doctor` says so). Sums, weights, the optimizer, states,
+            times, the loss and the validation stay as they are.
     """
 
     epochs: int | None = None
@@ -436,7 +438,7 @@ class Recipe:
         tasks_per_epoch: number of tasks.
         redraw: how windows and masks are drawn; None keeps those of the training set.
         loss: `head` or `relative`.
-        precision: of the products of a step on a GPU.
+        precision: of the products of a step.
     """
 
     epochs: int

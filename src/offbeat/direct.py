@@ -43,11 +43,11 @@ def unsupported(model: BaseModel, examples: object, recipe: Recipe) -> str | Non
         return "its step inputs are not in a table"
     if model.needs_generator or model.config.self_feeding:
         return "self-feeding draws the steps"
-    if recipe.precision != "float32":
-        return f"its precision is {recipe.precision}"
     choice = choose(model.spec, model.dtype, model.device)
     if choice.backend.name != "cpu":
         return f"its scan runs in {choice.backend.name}"
+    if recipe.precision != ("bf16" if choice.variant in cpu.bf16_sets() else "float32"):
+        return f"its precision is {recipe.precision}, and {choice.variant} is selected"
     if not hasattr(cpu.compiled, "move_weights"):
         return "the compiled module is of an earlier version; build it again"
     parts, one = model.scan_parts(), examples.prepared.take(torch.zeros(1, dtype=torch.int64))

@@ -45,6 +45,7 @@ def examine() -> dict[str, Any]:
         "device auto": _device(),
         "scan backend": _scan_backend(),
         "instruction sets": ", ".join(cpu.instruction_sets()) or f"none: {cpu.why_not}",
+        "precision bf16": ", ".join(cpu.bf16_sets()) or "not on this CPU",
         "MUJOCO_GL": os.environ.get("MUJOCO_GL", "not set"),
     }
     for name, extra in dependencies() or [(name, "") for name in NEEDED_FOR]:

@@ -34,6 +34,7 @@ class Backend:
         variants: names of its variants, such as instruction sets, for `OFFBEAT_SCAN`.
         available: variants that run here, best first; empty if the backend was not
             built. A backend without variants returns its own name.
+        named_only: variants that run here and that only their name selects.
         why_not: the reason if none is available.
         fix: what makes it available.
         perceptron: (layers, x, activation, variant) to the outputs, or to None if the call
@@ -51,6 +52,7 @@ class Backend:
     ]
     variants: tuple[str, ...] = ()
     available: Callable[[], Sequence[str]] | None = None
+    named_only: Callable[[], Sequence[str]] = tuple
     why_not: Callable[[], str] = str
     fix: str = "install Offbeat where a C++ compiler is available"
     perceptron: Callable[[Layers, Tensor, str, str | None], Tensor | None] | None = None
@@ -142,9 +144,10 @@ def choose(
             f"built ({backend.why_not()}); {backend.fix}"
         )
     variant = name if name in named else runnable[0]
-    if variant not in runnable:
+    if variant not in runnable and variant not in (more := backend.named_only()):
         raise InputError(
-            f"{where} asks for the scan backend {name!r}; this processor runs {', '.join(runnable)}"
+            f"{where} asks for the scan backend {name!r}; this processor runs "
+            f"{', '.join((*runnable, *more))}"
         )
     reason = _why_not(backend, spec, dtype, device)
     if reason is not None:

@@ -72,9 +72,10 @@ class BufferedScan:
         )
         self._inputs = cpu.compiled_inputs(rows, state.dtype)
         self._packed, self._state, self._rows = packed, state, rows
-        size = cpu.tape_size(self._spec, self._variant, self._inputs, state)
-        if size is None or self._tape.numel() != size:
-            self._tape = state.new_empty(size or 0)
+        size = cpu.tape_size(self._spec, self._variant, self._inputs, state, stays=True)
+        if size is not None and self._tape.numel() < size:  # of the longest batch so far
+            self._tape = state.new_empty(size)
+        self._kept = None if size is None else self._tape[:size].numpy()
         cpu.compiled.scan_forward(
             self._own,
             self._variant,
@@ -83,10 +84,9 @@ class BufferedScan:
             state.numpy(),
             before.numpy(),
             after.numpy(),
-            None if size is None else self._tape.numpy(),
+            self._kept,
             cpu.threads(),
         )
-        self._kept = size is not None
         return before, after
 
     def backward(self, to_before: Tensor | None, to_after: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -99,7 +99,7 @@ class BufferedScan:
             self._inputs,
             self._state.numpy(),
             self._states[1].numpy(),
-            self._tape.numpy() if self._kept else None,
+            self._kept,
             None if to_before is None else to_before.numpy(),
             None if to_after is None else to_after.numpy(),
             to_packed.numpy(),

@@ -45,6 +45,12 @@ stores only the states (`state_size` numbers per row, twice), and the backward p
 rest, a few rows at a time (`benchmarks/scaling.py` measures the cost). Larger blocks of memory are
 mapped anew at each call, which can cost more than to compute twice."""
 
+KEPT_TAPE_LIMIT = 512 * 2**20
+"""Bytes. The same in memory that stays from step to step, as in most trainings (`direct.py`). With
+products in bfloat16, which take little time to compute twice, only with layers of `WIDE` units."""
+
+WIDE = 256
+
 TAPE_LIMIT_WITHOUT_FIELD = 8 * 2**20
 """Bytes. The same for scans without a vector field, whose activations take less time to compute
 than to bring back from outside of the caches of a core."""
@@ -94,6 +100,14 @@ def own_threads() -> Iterator[None]:
 def instruction_sets() -> list[str]:
     """Names of the instruction sets that this processor can run, best first."""
     return list(compiled.instruction_sets()) if compiled is not None else []
+
+
+def bf16_sets() -> list[str]:
+    """Names of the instruction sets for products in bfloat16, best first; `auto` takes none.
+
+    On Linux the first call asks for the tile registers of AMX, which a process may then use.
+    """
+    return list(compiled.bf16_sets()) if hasattr(compiled, "bf16_sets") else []
 
 
 def has_trends() -> bool:
@@ -252,7 +266,9 @@ def compiled_inputs(rows: StepInputs | TableSteps, dtype: torch.dtype) -> Any:
     return made(**given, use_prediction=fed)
 
 
-def tape_size(spec: ScanSpec, variant: str, inputs: Any, state: Tensor) -> int | None:
+def tape_size(
+    spec: ScanSpec, variant: str, inputs: Any, state: Tensor, *, stays: bool = False
+) -> int | None:
     """Numbers that a forward pass stores for its backward pass; None for the states alone.
 
     Args:
@@ -260,9 +276,12 @@ def tape_size(spec: ScanSpec, variant: str, inputs: Any, state: Tensor) -> int |
         variant: name of an instruction set.
         inputs: from `compiled_inputs`.
         state: (batch, state_size) before the first step, contiguous.
+        stays: their memory stays from step to step.
     """
     size: int = compiled.tape_size(compiled_spec(spec), variant, inputs, _array(state))
     limit = TAPE_LIMIT if spec.field else min(TAPE_LIMIT, TAPE_LIMIT_WITHOUT_FIELD)
+    if stays and spec.field and (not variant.endswith("bf16") or max(spec.field) >= WIDE):
+        limit = max(limit, KEPT_TAPE_LIMIT)
     return size if size * state.element_size() <= limit else None
 
 
