@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from safetensors.numpy import load_file
 from torch import Tensor, nn
 
 import offbeat as ob
 from examples.linear_state_space import LRUNetwork
-from examples.policies.robots import HERE, linear
+from examples.policies.robots import HERE, expert
 from examples.real_logs.results import machine
 from offbeat.baselines import fit_baseline
 from offbeat.comparison.statistics import holm, welch_t
@@ -128,10 +129,10 @@ def made(rollouts: int, stride: int) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset
     each = rollouts // len(LEVELS)
     found = []
     for i, name in enumerate(LEVELS.values()):
-        expert = _nothing if name is None else linear(HERE / f"{name}.safetensors")
+        act = _nothing if name is None else expert(load_file(HERE / f"{name}.safetensors"))
         seed = 100_000 * (i + 1)
         found += list(
-            demonstrate(expert, "Walker2d-v5", each, seed=seed, random_actions=RANDOM_ACTIONS)
+            demonstrate(act, "Walker2d-v5", each, seed=seed, random_actions=RANDOM_ACTIONS)
         )
     random = np.random.default_rng(0)
     order = random.permutation(len(found))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
 from . import pendulum
@@ -42,15 +43,26 @@ class Robot:
     window: int = 50
 
 
-def linear(path: Path) -> Callable[[Any], Any]:
-    """The expert that `examples.policies.expert` wrote.
+def expert(tensors: dict[str, NDArray[Any]]) -> Callable[[Any], Any]:
+    """Observations (..., n) to actions (..., m) between -1 and 1.
 
     Args:
-        path: its file.
+        tensors: "matrix" and "mean" as `examples.policies.expert` writes them, or "weight_i" and
+            "bias_i" of three layers as `examples.policies.sac` does.
     """
-    tensors = load_file(path)
-    matrix, mean = tensors["matrix"], tensors["mean"]
-    return lambda seen: np.clip((np.asarray(seen) - mean) @ matrix.T, -1.0, 1.0)
+    if "matrix" in tensors:
+        matrix, mean = tensors["matrix"], tensors["mean"]
+        return lambda seen: np.clip((np.asarray(seen) - mean) @ matrix.T, -1.0, 1.0)
+    layers = [(tensors[f"weight_{i}"].T, tensors[f"bias_{i}"]) for i in range(3)]
+
+    def act(seen: Any) -> Any:
+        inner = np.asarray(seen, np.float32)
+        for weight, bias in layers[:-1]:
+            inner = np.maximum(inner @ weight + bias, 0.0)
+        weight, bias = layers[-1]
+        return np.tanh(inner @ weight + bias)
+
+    return act
 
 
 def robots() -> dict[str, Robot]:
@@ -67,5 +79,5 @@ def robots() -> dict[str, Robot]:
     ):
         path = HERE / f"{name}.safetensors"
         if path.exists():
-            found[name] = Robot(env, linear(path), (-1.0, 1.0), 40, 0.1, dt, epochs=80)
+            found[name] = Robot(env, expert(load_file(path)), (-1.0, 1.0), 40, 0.1, dt, epochs=80)
     return found
