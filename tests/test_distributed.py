@@ -16,6 +16,7 @@ import offbeat as ob
 from offbeat.cli.app import main
 from offbeat.distributed import LostRankError, Ranks, group
 
+MODELS = ("gru", "gru_d", "ode_rnn")  # the last one without autograd
 SCRIPT = Path(__file__).with_name("rank_script.py")
 
 
@@ -41,15 +42,15 @@ def started(ranks: int, *arguments: object) -> list[tuple[int, str]]:
 def alone(tmp_path_factory):
     """Weights of one process after two epochs."""
     out = tmp_path_factory.mktemp("alone")
-    [(code, said)] = started(1, out, 2, "gru,gru_d")
+    [(code, said)] = started(1, out, 2, ",".join(MODELS))
     assert code == 0, said
-    return {name: np.load(out / f"{name}-weights-0.npy") for name in ("gru", "gru_d")}
+    return {name: np.load(out / f"{name}-weights-0.npy") for name in MODELS}
 
 
 def test_two_ranks_train_as_one_up_to_rounding_and_with_the_same_bits_as_each_other(
     alone, tmp_path
 ):
-    for code, said in started(2, tmp_path, 2, "gru,gru_d"):
+    for code, said in started(2, tmp_path, 2, ",".join(MODELS)):
         assert code == 0, said
         assert "threads of gloo: 0" in said
     for name, expected in alone.items():

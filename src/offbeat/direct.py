@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from offbeat.config import Recipe
-from offbeat.distributed import current
 from offbeat.examples import Examples
 from offbeat.kernels import StepTable, choose, cpu
 from offbeat.kernels.backends import BACKENDS, selected
@@ -35,8 +34,6 @@ def unsupported(model: BaseModel, examples: object, recipe: Recipe) -> str | Non
         examples: of the epoch.
         recipe: of the training.
     """
-    if current() is not None:
-        return "several ranks exchange their gradients within a step"
     if type(model) is not Model or type(model.head) is not Point or model.acts:
         return "only models of parts with a point head have steps that are known"
     if type(examples) is not Examples or not isinstance(examples.prepared, StepTable):

@@ -292,10 +292,17 @@ class Examples:
             generator: of self-feeding.
             host: as of `loss`.
         """
-        loss = self.loss(model, index, generator, host=host)
+        return self.loss(model, index, generator, host=host), self.count(index)
+
+    def count(self, index: Tensor) -> Tensor:
+        """How many values count in some trajectories, or the sum of their weights.
+
+        Args:
+            index: (batch,) positions of the trajectories.
+        """
         if self.counted is None:
-            return loss, loss.new_tensor(len(index) * self.targets[0].numel())
-        return loss, self.counted.index_select(0, index.to(self.counted.device)).sum()
+            return self.targets.new_tensor(len(index) * self.targets[0].numel())
+        return self.counted.index_select(0, index.to(self.counted.device)).sum()
 
 
 class RedrawnExamples:

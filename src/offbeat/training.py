@@ -426,7 +426,8 @@ def train_step(
         _set_rate(state, recipe, total)
         value = float(_descend_together(ranks, model, examples, index, state, recipe))
         _check_loss(value, state.epoch, state.step)
-        state.optimizer.step()
+        direct = direct_step(model, examples, state, recipe)
+        direct.descend() if direct is not None else state.optimizer.step()
         return value
     if (direct := direct_step(model, examples, state, recipe)) is not None:
         value = direct.loss(index)
@@ -500,7 +501,11 @@ def _descend_together(
     state.parameters.zero_gradient()
     own = ranks.share(index)
     loss = count = state.parameters.flat.new_zeros(())
-    if len(own):
+    if len(own) and (direct := direct_step(model, examples, state, recipe)) is not None:
+        assert isinstance(examples, Examples)
+        loss, count = loss.new_tensor(direct.loss(own)), examples.count(own)
+        direct.backward()
+    elif len(own):
         generator = _generator(model, state, recipe)
         with autocast(model, recipe.precision):
             if host is None:
