@@ -6,7 +6,7 @@ proportion to the size has `per_unit` 1 everywhere.
 
     python benchmarks/scaling.py --json results/benchmarks/scaling.json
 
-`--figure` draws the sweeps, and the growth with the size of a data set that `shards.py` measured.
+`--figure` draws the sweeps, and what `shards.py` and `runs_and_ranks.py` measured.
 """
 
 from __future__ import annotations
@@ -111,13 +111,13 @@ LABELS = {
 }
 
 
-def draw(sweeps: dict[str, Any], shards: Path, figure_path: str) -> None:
+def draw(sweeps: dict[str, Any], shards: Path, together: Path, figure_path: str) -> None:
     """A panel for each size, beside a cost in proportion to it from the first point on."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
-    figure = Figure(figsize=(9, 5.4), layout="constrained")
-    panels = figure.subplots(2, 3).ravel()
+    figure = Figure(figsize=(12, 5.4), layout="constrained")
+    panels = figure.subplots(2, 4).ravel()
     panels[-1].axis("off")
 
     def panel(axes: Any, sizes: list[float], costs: list[float], label: str, unit: str) -> None:
@@ -138,6 +138,21 @@ def draw(sweeps: dict[str, Any], shards: Path, figure_path: str) -> None:
         read = json.loads(shards.read_text(encoding="utf-8"))["sizes"]
         costs = [each["epoch_cpu_s"] for each in read.values()]
         panel(panels[4], [float(v) for v in read], costs, "data set in shards, GB", "an epoch, s")
+    if together.exists():
+        read = json.loads(together.read_text(encoding="utf-8"))
+        costs = list(read["runs"].values())
+        panel(panels[5], [float(n) for n in read["runs"]], costs, "runs of a sweep", "s")
+        for batch, times in read["ranks"].items():
+            ranks = {int(k.split()[0]): v for k, v in times.items() if k.endswith("ranks")}
+            panels[6].loglog(list(ranks), list(ranks.values()), "o-", label=f"batch {batch}")
+            ideal = [times["1 ranks"] / n for n in ranks]
+            panels[6].loglog(list(ranks), ideal, ":", color="0.6")
+        panels[6].set(xlabel="ranks of a training", ylabel="an epoch, s")
+        panels[6].set_xticks(list(ranks), [str(n) for n in ranks])
+        panels[6].minorticks_off()
+        panels[6].yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panels[6].yaxis.set_major_formatter("{x:g}")
+        panels[6].legend(frameon=False)
     panels[0].legend(frameon=False)
     figure.savefig(figure_path, dpi=150)
 
@@ -157,6 +172,9 @@ def main() -> None:
     parser.add_argument("--json")
     parser.add_argument("--figure")
     parser.add_argument("--shards", type=Path, default=Path("results/benchmarks/shards.json"))
+    parser.add_argument(
+        "--together", type=Path, default=Path("results/benchmarks/runs_and_ranks.json")
+    )
     options = parser.parse_args()
     clock = CLOCKS[options.clock]
     torch.set_num_threads(options.threads)
@@ -202,8 +220,8 @@ def main() -> None:
     found["weight gradients added"] = times
     print(f"weight gradients added: {times}")
     if options.figure:
-        draw(found, options.shards, options.figure)
-    used = {k: v for k, v in vars(options).items() if k != "shards"}
+        draw(found, options.shards, options.together, options.figure)
+    used = {k: v for k, v in vars(options).items() if k not in ("shards", "together")}
     write(options.json, {"machine": machine(), "options": used, "sweeps": found})
 
 
