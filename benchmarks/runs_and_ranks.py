@@ -45,7 +45,7 @@ def train(batch: int, epochs: int, threads: int, out: Path) -> None:
 
 
 def epoch_s(ranks: int, threads: int, batch: int, epochs: int) -> list[float]:
-    """s of each epoch but the first.
+    """Seconds of each epoch but the first.
 
     Args:
         ranks: processes.
