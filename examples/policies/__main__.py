@@ -39,15 +39,19 @@ TRAININGS = {
 FIRST_SEED = 50_000  # of the tests
 
 
-def conditions(robot: Robot) -> dict[str, dict[str, Any]]:
-    """What is lost and late in a test, by name."""
-    frames = {f"{100 * d:.0f} %": {"drop": d} for d in (0.0, 0.3, 0.5, 0.7, 0.9)}
-    return {
-        **frames,
+def conditions(robot: Robot, episodes: int) -> dict[str, list[dict[str, Any]]]:
+    """What is lost and late in each episode of a test, by name."""
+    found: dict[str, dict[str, Any]] = {
+        **{f"{100 * d:.0f} %": {"drop": d} for d in (0.0, 0.3, 0.5, 0.7, 0.9)},
         "bursts": {"bursts": 0.3, "burst_s": (0.1, 0.5)},
         "sensors": {"sensor_drop": 0.5},
         "delay": {"delay_s": 2 * robot.dt},
     }
+    each = {name: [lost] * episodes for name, lost in found.items()}
+    if robot.encoders:  # one of them in each episode
+        turns = [robot.encoders[i % len(robot.encoders)] for i in range(episodes)]
+        each["encoder"] = [{"sensors": (one,), "sensor_drop": 0.9} for one in turns]
+    return each
 
 
 class Random:
@@ -89,8 +93,8 @@ def tested(controller: Any, robot: Robot, episodes: int, steps: int | None) -> d
 
     The episodes of all conditions run side by side.
     """
-    asked = conditions(robot)
-    lost = iter([each for each in asked.values() for _ in range(episodes)])
+    asked = conditions(robot, episodes)
+    lost = iter([one for each in asked.values() for one in each])
     found = rollout(
         controller,
         lambda: Again(gymnasium_env(robot.env), episodes, **next(lost)),

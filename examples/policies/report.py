@@ -39,7 +39,7 @@ def table(folder: Path, training: str) -> str:
         if not found:
             lines.append(f"| {rival} |" + " not run |" * (len(names) + 2))
             continue
-        returns = {k: [r["returns"][k] for r in found] for k in names}
+        returns = {k: [r["returns"][k] for r in found if k in r["returns"]] for k in names}
         seconds = np.mean([r["training_seconds"] for r in found])
         lines.append(f"{_line(folder, rival, returns)} | {len(found)} | {seconds:.0f} |")
     return "\n".join(lines)

@@ -30,6 +30,7 @@ class Robot:
         names: of the observed channels.
         epochs: of a training.
         window: rows of the windows.
+        encoders: positions of the angle and the velocity of each joint that is driven.
     """
 
     env: str
@@ -41,6 +42,7 @@ class Robot:
     names: tuple[str, ...] | None = None
     epochs: int = 150
     window: int = 50
+    encoders: tuple[tuple[int, int], ...] = ()
 
 
 def expert(tensors: dict[str, NDArray[Any]]) -> Callable[[Any], Any]:
@@ -72,12 +74,25 @@ def robots() -> dict[str, Robot]:
             "Pendulum-v1", pendulum.expert, (-2.0, 2.0), 50, 0.3, 0.05, pendulum.NAMES
         )
     }
-    for name, env, dt in (
-        ("hopper", "Hopper-v5", 0.008),
-        ("half_cheetah", "HalfCheetah-v5", 0.05),
-        ("walker2d", "Walker2d-v5", 0.008),
+    for name, env, dt, joints in (
+        ("hopper", "Hopper-v5", 0.008, 3),
+        ("half_cheetah", "HalfCheetah-v5", 0.05, 6),
+        ("walker2d", "Walker2d-v5", 0.008, 6),
     ):
-        path = HERE / f"{name}.safetensors"
-        if path.exists():
-            found[name] = Robot(env, expert(load_file(path)), (-1.0, 1.0), 40, 0.1, dt, epochs=80)
+        for key, suffix in ((name, ""), (f"{name}_sac", "_sac")):
+            path = HERE / f"{name}{suffix}.safetensors"
+            if path.exists():
+                act = expert(load_file(path))
+                found[key] = Robot(
+                    env, act, (-1.0, 1.0), 40, 0.1, dt, epochs=80, encoders=encoders(joints)
+                )
     return found
+
+
+def encoders(joints: int) -> tuple[tuple[int, int], ...]:
+    """Of a robot in the plane: its height, its pitch and the angles, then all their velocities.
+
+    Args:
+        joints: that are driven.
+    """
+    return tuple((2 + i, 2 + joints + 3 + i) for i in range(joints))

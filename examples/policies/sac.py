@@ -3,11 +3,11 @@
     python -m examples.policies.sac Hopper-v5 --out runs/sac --steps 400000
 
 SAC of Haarnoja et al. 2018 (arXiv:1801.01290) as SBX has it, the JAX sister of Stable-Baselines3
-(`pip install sbx-rl`), with its own settings but for layers of 128 units and 8 updates every 8
-steps. A training that was
-stopped goes on from its last evaluation; its state is pickled by Stable-Baselines3, so `--out`
-must be a folder that this script wrote. The actor of every evaluation is kept, so that there are
-experts of several levels of skill.
+(`pip install sbx-rl`), with its own settings but for layers of 128 units, 8 updates every 8
+steps and 10,000 random actions at the start. A training that was stopped goes on from one of its
+last evaluations; its state is pickled by Stable-Baselines3, so `--out` must be a folder that this
+script wrote. The actor of every evaluation is kept, so that there are experts of several levels of
+skill.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def mean_return(env: Any, act: Any, episodes: int = 10) -> float:
     return total / episodes
 
 
-def train(name: str, folder: Path, steps: int, every: int, seed: int) -> None:
+def train(name: str, folder: Path, steps: int, every: int, random: int, seed: int) -> None:
     """Trains up to `steps` of the environment; keeps the best actor by the mean return.
 
     Args:
@@ -64,6 +64,7 @@ def train(name: str, folder: Path, steps: int, every: int, seed: int) -> None:
         folder: a folder of this script.
         steps: of the environment, those of an earlier call counted.
         every: steps between evaluations.
+        random: steps of random actions at the start.
         seed: of the training.
     """
     from sbx import SAC
@@ -82,6 +83,7 @@ def train(name: str, folder: Path, steps: int, every: int, seed: int) -> None:
             env,
             seed=seed,
             buffer_size=steps,
+            learning_starts=random,
             train_freq=TOGETHER,
             gradient_steps=TOGETHER,
             policy_kwargs={"net_arch": [UNITS] * 2},
@@ -114,9 +116,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/sac"))
     parser.add_argument("--steps", type=int, default=400_000)
     parser.add_argument("--every", type=int, default=10_000)
+    parser.add_argument("--random", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    train(given.env, given.out, given.steps, given.every, given.seed)
+    train(given.env, given.out, given.steps, given.every, given.random, given.seed)
 
 
 if __name__ == "__main__":
