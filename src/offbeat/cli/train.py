@@ -116,20 +116,20 @@ def train_command(
     torch.set_num_threads(threads)
     open_split = split == SplitConfig(seed=split.seed)
     given_split = None if open_split else split
-    opened = _opened_lazily(data, lazy, two_sided, reader, out)
-    chosen = dataset = None
-    if opened is None:
-        with busy("reading and inspecting the log"):
-            dataset, chosen = read_planned(
-                data, reader, horizon_s=horizon_s, split=given_split, seed=split.seed
-            )
-    if chosen is not None:
-        reader, split = dict(chosen.reader), chosen.split
-        for note in chosen.notes:
-            print(f"offbeat: {note}", file=sys.stderr)
-    as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
     open_model = model == ModelConfig()
     with group(device) as ranks, locked(out) if is_first() else nullcontext():
+        opened = _opened_lazily(data, lazy, two_sided, reader, out)
+        chosen = dataset = None
+        if opened is None:
+            with busy("reading and inspecting the log"):
+                dataset, chosen = read_planned(
+                    data, reader, horizon_s=horizon_s, split=given_split, seed=split.seed
+                )
+        if chosen is not None:
+            reader, split = dict(chosen.reader), chosen.split
+            for note in chosen.notes:
+                print(f"offbeat: {note}", file=sys.stderr)
+        as_it_is = chosen is None or (not open_split and split.observed_fraction is not None)
         common: dict[str, Any] = {
             "horizon_s": horizon_s,
             "training": config,
@@ -217,6 +217,7 @@ def _opened_lazily(
     from offbeat.data.memory import available_memory, gigabytes
     from offbeat.data.shards import ShardedDataset
     from offbeat.data.store import holds_data_set
+    from offbeat.distributed import on_first
     from offbeat.run import CONVERTED
 
     first = next(iter(sorted(data.glob("*.parquet"))), None) if data.is_dir() else None
@@ -234,8 +235,14 @@ def _opened_lazily(
     if ours:
         opened = ShardedDataset.open(data)
     else:
+        options = {**CONVERTED_WITH, **(reader or {})}
+
+        def converted() -> None:
+            convert(data, out / CONVERTED, **options)
+
         with busy(f"converting the files of {data} to {out / CONVERTED}"):
-            opened = convert(data, out / CONVERTED, **{**CONVERTED_WITH, **(reader or {})})
+            on_first(converted)  # the other ranks wait, and find it done
+        opened = convert(data, out / CONVERTED, **options)
     free = available_memory()
     if not lazy and (free is None or opened.bytes <= LARGE * free):
         return None
