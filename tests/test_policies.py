@@ -24,6 +24,7 @@ from offbeat.policies import (
     fit_policy,
     rollout,
 )
+from offbeat.policies.fitting import _rows, _windows
 
 NAMES = ("angle", "speed", "push")
 ROLES = ("state", "state", "action")
@@ -383,6 +384,7 @@ def test_a_wrong_option_of_a_cloning_says_what_was_expected(change, message):
         ({"window": 1}, "window must be at least 2 rows"),
         ({"learning_rate": -1.0}, "learning_rate must be a positive"),
         ({"observation_weight": -1.0}, "observation_weight must be at least 0"),
+        ({"starts": 1.5}, "starts must be a fraction from 0 to 1, got 1.5"),
     ],
 )
 def test_a_wrong_config_is_refused(change, message):
@@ -411,10 +413,32 @@ def test_the_same_seed_clones_the_same_policy():
     assert not np.array_equal(first, differs)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_fraction_of_the_windows_begins_where_a_demonstration_does(share):
+    # Values that are the number of their row, so that a window tells where it begins.
+    rows = np.arange(500.0)
+    shown = ob.Dataset(
+        tuple(
+            ob.Trajectory(0.02 * rows, np.stack([rows, rows], 1), roles=("state", "action"))
+            for _ in range(40)
+        )
+    )
+    model = ob.make_model("gru", shown, scaler="identity", head="actions")
+    whole = _rows(model, shown, None)
+    config = CloneConfig(window=20, starts=share)
+    drawn = _windows(whole, Drops(frames=0.0), config, np.random.default_rng(0))
+    first = drawn.values[:, 0, 0].numpy()
+    assert len(first) == 40 * 25
+    # 481 places; 1,000 windows, so three standard errors are 0.044 at 0.3.
+    assert (first == 0).mean() == pytest.approx(share + (1 - share) / 481, abs=0.045 * (share < 1))
+    if share == 0:
+        assert len(np.unique(first)) > 300
+
+
 def test_the_best_epoch_is_kept():
     # Those that validate are as long as a window, so that each is one, and its error known.
     shown = demonstrations(count=4, rows=20)
-    config = CloneConfig(epochs=8, window=20, learning_rate=0.3)
+    config = CloneConfig(epochs=8, window=20, learning_rate=0.3, starts=0.0)
     policy = fit_policy(demonstrations(), "gru", validation=shown, config=config,
                         drops=Drops(0.0), progress=False, **SMALL)  # fmt: skip
     errors = [record.validation for record in policy.log]

@@ -125,6 +125,9 @@ def main(given: list[str] | None = None) -> None:
     add("--robot", default="pendulum", help=f"one of {', '.join(robots())}")
     add("--seeds", type=int, default=3, help="trainings of each rival")
     add("--training", nargs="+", default=["drops"], choices=TRAININGS, help="what training loses")
+    add(
+        "--starts", type=float, default=0.1, help="fraction of windows from the start of an episode"
+    )
     add("--only", default="", help="names of rivals, separated by semicolons")
     add("--episodes", type=int, default=20)
     add("--steps", type=int, help="that an episode of a test is cut off after")
@@ -158,7 +161,9 @@ def main(given: list[str] | None = None) -> None:
         if train is None:
             train, validation = shown(robot)
         model, options = options_of(name)
-        config = CloneConfig(epochs=robot.epochs, window=robot.window, seed=seed)
+        config = CloneConfig(
+            epochs=robot.epochs, window=robot.window, starts=asked.starts, seed=seed
+        )
         began = time.process_time()
         policy = fit_policy(
             train,
@@ -178,6 +183,7 @@ def main(given: list[str] | None = None) -> None:
                 "rival": name,
                 "training": training,
                 "seed": seed,
+                "starts": asked.starts,
                 "returns": found,
                 "validation": min(record.validation for record in policy.log),
                 "parameters": sum(p.numel() for p in policy.model.parameters()),

@@ -45,6 +45,8 @@ class CloneConfig:
             trains on actions alone.
         epochs: passes over the demonstrations.
         window: rows of the windows that are trained on; None takes whole demonstrations.
+        starts: fraction of the windows that begin where a demonstration does, as every rollout
+            does; the others begin anywhere.
         batch_size: windows per step.
         learning_rate: of Adam, at the start; it decays to 0 along a cosine.
         clip_norm: gradients are scaled down to this norm.
@@ -55,6 +57,7 @@ class CloneConfig:
     observation_weight: float = 0.1
     epochs: int = 200
     window: int | None = 50
+    starts: float = 0.1
     batch_size: int = 16
     learning_rate: float = 0.01
     clip_norm: float = 1.0
@@ -70,6 +73,8 @@ class CloneConfig:
         for name in ("learning_rate", "clip_norm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be a positive number, got {getattr(self, name)!r}")
+        if not 0 <= self.starts <= 1:
+            raise InputError(f"starts must be a fraction from 0 to 1, got {self.starts!r}")
         if not 0 <= self.observation_weight < math.inf:
             raise InputError(
                 f"observation_weight must be at least 0, got {self.observation_weight!r}"
@@ -206,13 +211,15 @@ def _rows(model: BaseModel, dataset: Dataset, sensors: list[list[str]] | None) -
     return _Rows(whole, whole.valid.sum(dim=1).cpu().numpy(), groups, seen)
 
 
-def _windows(rows: _Rows, drops: Drops, window: int | None, random: np.random.Generator) -> Batch:
+def _windows(rows: _Rows, drops: Drops, config: CloneConfig, random: np.random.Generator) -> Batch:
     """Windows of all demonstrations, as many as cover them, with what arrives of them."""
     whole = rows.whole
-    length = min(window or whole.rows, whole.rows)
+    length = min(config.window or whole.rows, whole.rows)
     each = np.repeat(np.arange(len(whole)), np.ceil(rows.lengths / length).astype(int))
     each = random.permutation(each)
     start = random.integers(0, np.maximum(rows.lengths[each] - length, 0) + 1)
+    if config.starts:
+        start[random.random(len(start)) < config.starts] = 0
     at = torch.from_numpy(start[:, None] + np.arange(length)).to(whole.times.device)
     index = torch.from_numpy(each).to(at.device)[:, None]
     cut: dict[str, Tensor] = {
@@ -230,7 +237,7 @@ def _windows(rows: _Rows, drops: Drops, window: int | None, random: np.random.Ge
 
 def _longest_silence(rows: _Rows, drops: Drops, config: CloneConfig) -> float:
     """s, the longest time since an observation in the windows of an epoch."""
-    drawn = _windows(rows, drops, config.window, np.random.default_rng([config.seed, 1]))
+    drawn = _windows(rows, drops, config, np.random.default_rng([config.seed, 1]))
     times, silence = drawn.times.cpu().numpy(), 0.0
     seen = (drawn.mask.any(dim=2) & drawn.valid).cpu().numpy()
     for i in range(len(times)):
@@ -249,7 +256,7 @@ class _Validation:
     """The error of the actions of demonstrations, on windows that are drawn once."""
 
     def __init__(self, model: BaseModel, rows: _Rows, drops: Drops, config: CloneConfig) -> None:
-        self.batch = _windows(rows, drops, config.window, np.random.default_rng([config.seed, 2]))
+        self.batch = _windows(rows, drops, config, np.random.default_rng([config.seed, 2]))
         acts = torch.tensor([role == ACTION for role in model.roles])
         self.counts = self.batch.targets & acts.to(self.batch.mask.device)
 
@@ -280,7 +287,7 @@ def _fit(
         optimizer = torch.optim.Adam([parameters.flat], lr=config.learning_rate, foreach=True)
         for epoch in range(config.epochs):
             random = np.random.default_rng([config.seed, 3, epoch])
-            batch = _windows(rows, drops, config.window, random)
+            batch = _windows(rows, drops, config, random)
             losses = []
             for first in range(0, len(batch), config.batch_size):
                 some = batch.take(slice(first, first + config.batch_size))
