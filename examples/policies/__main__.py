@@ -160,9 +160,9 @@ def main(given: list[str] | None = None) -> None:
             return
         if train is None:
             train, validation = shown(robot)
-        model, options = options_of(name)
+        model, options = options_of(name, robot.decoder_units)
         config = CloneConfig(
-            epochs=robot.epochs, window=robot.window, starts=asked.starts, seed=seed
+            epochs=robot.epochs, window=robot.window, starts=robot.starts, seed=seed
         )
         began = time.process_time()
         policy = fit_policy(
@@ -183,7 +183,8 @@ def main(given: list[str] | None = None) -> None:
                 "rival": name,
                 "training": training,
                 "seed": seed,
-                "starts": asked.starts,
+                "starts": robot.starts,
+                "decoder_units": robot.decoder_units,
                 "returns": found,
                 "validation": min(record.validation for record in policy.log),
                 "parameters": sum(p.numel() for p in policy.model.parameters()),

@@ -112,14 +112,14 @@ def run(data: ob.Dataset, name: str, training: str, seed: int, path: Path) -> No
     began = time.process_time()
     policy, record = None, {}
     if name != HELD:
-        model, options = options_of(name)
+        model, options = options_of(name, (100,))
         policy = fit_policy(
             train,
             model,
             validation=validation,
             drops=TRAININGS[training],
             sensors=sensors_of(data.names),
-            config=CloneConfig(epochs=EPOCHS, window=WINDOW, seed=seed),
+            config=CloneConfig(epochs=EPOCHS, window=WINDOW, starts=0.0, seed=seed),
             progress=False,
             **options,
             **({} if model == "held" else {"hidden_size": HIDDEN}),

@@ -32,14 +32,14 @@ def cloned(robot: Robot, name: str, path: Path) -> Policy:
     if path.exists():
         return Policy.load(path)
     train, validation = shown(robot)
-    model, options = options_of(name)
+    model, options = options_of(name, robot.decoder_units)
     policy = fit_policy(
         train,
         model,
         validation=validation,
         bounds=([robot.bounds[0]], [robot.bounds[1]]),
         drops=TRAININGS["all drops"],
-        config=CloneConfig(epochs=robot.epochs, window=robot.window),
+        config=CloneConfig(epochs=robot.epochs, window=robot.window, starts=robot.starts),
         **options,
     )
     policy.save(path)

@@ -70,11 +70,13 @@ FIELDS = {"field_units": (50, 50)}
 """Of the models with a vector field, all alike."""
 
 
-def options_of(name: str) -> tuple[str, dict[str, Any]]:
+def options_of(name: str, decoder_units: tuple[int, ...]) -> tuple[str, dict[str, Any]]:
     """The model of a rival, and its options.
 
     Args:
         name: of `RIVALS`.
+        decoder_units: of networks other than the perceptrons.
     """
     model, options = RIVALS[name]
-    return model, {**options, **(FIELDS if "ode" in model else {})}
+    decoder = {} if model == "held" else {"decoder_units": decoder_units}
+    return model, {**options, **decoder, **(FIELDS if "ode" in model else {})}

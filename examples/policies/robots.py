@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,9 @@ from safetensors.numpy import load_file
 from . import pendulum
 
 HERE = Path(__file__).parent
+DEFAULTS: dict[str, Any] = {"starts": 0.1, "decoder_units": (100, 100)}
+"""Those of `fit_policy`. The linear experts were cloned before, with windows from anywhere and one
+layer."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,8 @@ class Robot:
         epochs: of a training.
         window: rows of the windows.
         encoders: positions of the angle and the velocity of each joint that is driven.
+        starts: fraction of the windows that begin where a demonstration does.
+        decoder_units: of the networks but the perceptrons.
     """
 
     env: str
@@ -43,6 +48,8 @@ class Robot:
     epochs: int = 150
     window: int = 50
     encoders: tuple[tuple[int, int], ...] = ()
+    starts: float = 0.0
+    decoder_units: tuple[int, ...] = (100,)
 
 
 def expert(tensors: dict[str, NDArray[Any]]) -> Callable[[Any], Any]:
@@ -79,13 +86,13 @@ def robots() -> dict[str, Robot]:
         ("half_cheetah", "HalfCheetah-v5", 0.05, 6),
         ("walker2d", "Walker2d-v5", 0.008, 6),
     ):
-        for key, suffix in ((name, ""), (f"{name}_sac", "_sac")):
-            path = HERE / f"{name}{suffix}.safetensors"
+        for key, options in ((name, {}), (f"{name}_sac", DEFAULTS)):
+            path = HERE / f"{key}.safetensors"
             if path.exists():
                 act = expert(load_file(path))
-                found[key] = Robot(
-                    env, act, (-1.0, 1.0), 40, 0.1, dt, epochs=80, encoders=encoders(joints)
-                )
+                at = encoders(joints)
+                robot = Robot(env, act, (-1.0, 1.0), 40, 0.1, dt, epochs=80, encoders=at)
+                found[key] = replace(robot, **options)
     return found
 
 

@@ -104,7 +104,7 @@ def learned(name: str, train: ob.Dataset, validation: ob.Dataset) -> Controller:
     """A controller from demonstrations."""
     if name in RIDGE:
         return kernel_ridge(train, validation, attracted=RIDGE[name])
-    model, options = options_of(name)
+    model, options = options_of(name, (100,))
     fastest = 1.2 * np.max(np.abs(np.concatenate([t.values[:, 2:] for t in train])), axis=0)
     return fit_policy(
         train,
@@ -112,7 +112,7 @@ def learned(name: str, train: ob.Dataset, validation: ob.Dataset) -> Controller:
         validation=validation,
         bounds=(-fastest, fastest),
         drops=DROPS,
-        config=CloneConfig(epochs=EPOCHS, window=None, batch_size=BATCH),
+        config=CloneConfig(epochs=EPOCHS, window=None, batch_size=BATCH, starts=0.0),
         progress=False,
         **options,
     )

@@ -30,7 +30,12 @@ from offbeat.run import flat_parameters
 ACTION_HEADS = {"mse": "actions", "nll": "gaussian_actions"}
 """Heads of the losses of actions."""
 
-COMPOSED = {"hidden_size": 32, "init": "fan_in", "field_units": (50, 50)}
+COMPOSED = {
+    "hidden_size": 32,
+    "init": "fan_in",
+    "field_units": (50, 50),
+    "decoder_units": (100, 100),
+}
 """Options of models of parts, where no others are given: those of the thesis train slowly here."""
 
 
