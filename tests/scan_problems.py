@@ -66,6 +66,13 @@ class Problem(NamedTuple):
             factors=(self.factors[0].double(), self.factors[1].double()),
         )
 
+    def nudged(self, towards: float) -> Problem:
+        """A copy whose numbers of the first state are the next ones towards a number."""
+        to = torch.full_like(self.state, towards)
+        state = torch.nextafter(self.state.detach(), to).requires_grad_()
+        tensors = [t.detach().clone().requires_grad_() for t in self.weights.tensors()]
+        return self._replace(weights=self.with_weights(tensors), state=state)
+
     def with_weights(self, tensors: Sequence[Tensor]) -> ScanParts:
         """The parts with other tensors, in the order of `ScanParts.tensors`."""
         left = list(tensors)
