@@ -57,9 +57,9 @@ def agree(case: Problem, *, keep: bool = True, strict: bool = True) -> None:
     off = dict.fromkeys(expected, 0.0)
     if not strict and case.state.dtype == torch.float32:
         exact = run(reference.scan, case.double())
-        near = [(expected, exact)]
-        for other in (case.nudged(-math.inf), case.nudged(math.inf)):
-            near.append((run(reference.scan, other), run(reference.scan, other.double())))
+        others = (case.nudged(-math.inf), case.nudged(math.inf))
+        near = [(run(reference.scan, c), run(reference.scan, c.double())) for c in others]
+        near.append((expected, exact))
         off = {
             name: max(float((found[name] - true[name]).abs().max()) for found, true in near)
             for name in expected
