@@ -107,7 +107,7 @@ LABELS = {
     "rows": "rows of a trajectory",
     "batch": "trajectories of a batch",
     "hidden": "hidden units",
-    "units": "units of each layer of the vector field",
+    "units": "units per layer of the field",
 }
 
 
@@ -141,7 +141,7 @@ def draw(sweeps: dict[str, Any], shards: Path, together: Path, figure_path: str)
     if together.exists():
         read = json.loads(together.read_text(encoding="utf-8"))
         costs = list(read["runs"].values())
-        panel(panels[5], [float(n) for n in read["runs"]], costs, "runs of a sweep", "s")
+        panel(panels[5], [float(n) for n in read["runs"]], costs, "runs of a sweep", "the sweep, s")
         for batch, times in read["ranks"].items():
             ranks = {int(k.split()[0]): v for k, v in times.items() if k.endswith("ranks")}
             panels[6].loglog(list(ranks), list(ranks.values()), "o-", label=f"batch {batch}")
