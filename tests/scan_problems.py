@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -260,3 +261,20 @@ def largest_error(got: Tensor, expected: Tensor) -> float:
         return 0.0
     scale = float(expected.abs().max())
     return float((got - expected).abs().max()) / (scale if scale > 0 else 1.0)
+
+
+@contextmanager
+def threads_restored() -> Iterator[None]:
+    """Context manager after which torch has as many threads as before."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def assert_same_bits(found: Sequence[dict[str, Tensor]]) -> None:
+    """Asserts that results of scans are equal to the last bit."""
+    for other in found[1:]:
+        for key, value in found[0].items():
+            assert torch.equal(other[key], value), key

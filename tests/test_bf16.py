@@ -10,7 +10,16 @@ from typing import Any
 import pytest
 import torch
 from model_helpers import dataset
-from scan_problems import CELLS, FLOWS, Problem, largest_error, problem, run
+from scan_problems import (
+    CELLS,
+    FLOWS,
+    Problem,
+    assert_same_bits,
+    largest_error,
+    problem,
+    run,
+    threads_restored,
+)
 from test_kernels import BITS, cut
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
@@ -162,19 +171,14 @@ def test_threads_groups_and_a_tape_change_no_bit(
     case = problem(
         seed=5, batch=150, rows=9, channels=4, hidden=37, units=(40, 70), padded=True, **BITS[model]
     )
-    threads = torch.get_num_threads()
     found = []
-    try:
+    with threads_restored():
         for n, group, limit in ((1, 0, 2**25), (2, 0, 2**25), (3, 1, 0), (7, 4, 0)):
             torch.set_num_threads(n)
             monkeypatch.setattr(cpu, "ROWS_AT_ONCE", group)
             monkeypatch.setattr(cpu, "TAPE_LIMIT", limit)
             found.append(scan_with(name, case))
-    finally:
-        torch.set_num_threads(threads)
-    for other in found[1:]:
-        for key, value in found[0].items():
-            assert torch.equal(other[key], value), key
+    assert_same_bits(found)
 
 
 @needs_bf16

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -13,7 +14,9 @@ import offbeat as ob
 from examples import irregular_walker
 from examples.linear_state_space import LRU
 from examples.policies import paired
+from examples.policies.__main__ import conditions
 from examples.policies.measures import distances, swept_error_area
+from examples.policies.robots import expert, robots
 from examples.policies.shapes import RETURNS_S, cloned, pushed
 
 
@@ -160,3 +163,48 @@ def test_networks_of_others_predict_a_window_alike_alone_and_among_others(kind):
 
 def _random() -> np.random.Generator:
     return np.random.default_rng(3)
+
+
+@pytest.mark.parametrize("name", ["hopper", "half_cheetah", "walker2d"])
+def test_an_encoder_is_the_angle_and_the_velocity_of_a_joint_that_is_driven(name):
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("mujoco")
+    from offbeat.data.robots import gymnasium_env
+
+    robot = robots()[name]
+    env = gymnasium_env(robot.env).unwrapped
+    env.reset(seed=0)
+    model, data = env.model, env.data
+    driven = [int(model.actuator_trnid[i, 0]) for i in range(model.nu)]
+    assert len(robot.encoders) == len(driven)
+    before = env._get_obs()
+    for joint, channels in zip(driven, robot.encoders, strict=True):
+        position, velocity = data.qpos.copy(), data.qvel.copy()
+        position[model.jnt_qposadr[joint]] += 0.1
+        velocity[model.jnt_dofadr[joint]] += 0.1
+        env.set_state(position, velocity)
+        changed = np.flatnonzero(env._get_obs() != before)
+        assert tuple(changed) == channels
+        position[model.jnt_qposadr[joint]] -= 0.1
+        velocity[model.jnt_dofadr[joint]] -= 0.1
+        env.set_state(position, velocity)
+        before = env._get_obs()
+    lost = conditions(robot, 20)["encoder"]
+    assert [one["sensors"][0] for one in lost[: len(driven)]] == list(robot.encoders)
+    assert len(lost) == 20
+
+
+def test_an_expert_is_its_layers():
+    random = np.random.default_rng(0)
+    sizes = (17, 128, 128, 6)
+    tensors, layers = {}, []
+    for i, (wide, out) in enumerate(itertools.pairwise(sizes)):
+        layer = torch.nn.Linear(wide, out)
+        tensors[f"weight_{i}"] = layer.weight.detach().numpy()
+        tensors[f"bias_{i}"] = layer.bias.detach().numpy()
+        layers += [layer, torch.nn.Tanh() if i == 2 else torch.nn.ReLU()]
+    seen = random.normal(size=(3, 17)).astype(np.float32)
+    wanted = torch.nn.Sequential(*layers)(torch.from_numpy(seen)).detach().numpy()
+    assert np.allclose(expert(tensors)(seen), wanted, atol=1e-6)
+    matrix, mean = np.array([[1.0, 0.0], [0.0, 30.0]]), np.array([0.5, 0.0])
+    assert np.allclose(expert({"matrix": matrix, "mean": mean})([1.0, 1.0]), [0.5, 1.0])

@@ -16,7 +16,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_helpers import SMALL, dataset, draw_weights
-from scan_problems import CELLS, FLOWS, Problem, largest_error, problem, run
+from scan_problems import (
+    CELLS,
+    FLOWS,
+    Problem,
+    assert_same_bits,
+    largest_error,
+    problem,
+    run,
+    threads_restored,
+)
 
 import offbeat as ob
 from offbeat import kernels
@@ -297,17 +306,12 @@ BITS = {
 @pytest.mark.parametrize("model", list(BITS))
 def test_the_number_of_threads_changes_no_bit(model: str, name: str) -> None:
     case = problem(seed=5, batch=150, rows=9, channels=4, hidden=7, padded=True, **BITS[model])
-    threads = torch.get_num_threads()
     found = []
-    try:
+    with threads_restored():
         for n in (1, 2, 3, 7):
             torch.set_num_threads(n)
             found.append(scan_with(name, case))
-    finally:
-        torch.set_num_threads(threads)
-    for other in found[1:]:
-        for key, value in found[0].items():
-            assert torch.equal(other[key], value), key
+    assert_same_bits(found)
 
 
 @needs_cpu

@@ -15,8 +15,8 @@ from . import pendulum
 
 HERE = Path(__file__).parent
 DEFAULTS: dict[str, Any] = {"starts": 0.1, "decoder_units": (100, 100)}
-"""Those of `fit_policy`. The linear experts were cloned before, with windows from anywhere and one
-layer."""
+"""Those of `fit_policy`. The linear experts, and robots "before", are cloned with windows from
+anywhere and one layer."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,12 @@ def robots() -> dict[str, Robot]:
         ("half_cheetah", "HalfCheetah-v5", 0.05, 6),
         ("walker2d", "Walker2d-v5", 0.008, 6),
     ):
-        for key, options in ((name, {}), (f"{name}_sac", DEFAULTS)):
-            path = HERE / f"{key}.safetensors"
+        for key, file, options in (
+            (name, name, {}),
+            (f"{name}_sac", f"{name}_sac", DEFAULTS),
+            (f"{name}_sac_before", f"{name}_sac", {}),
+        ):
+            path = HERE / f"{file}.safetensors"
             if path.exists():
                 act = expert(load_file(path))
                 at = encoders(joints)

@@ -237,12 +237,15 @@ def _opened_lazily(
     else:
         options = {**CONVERTED_WITH, **(reader or {})}
 
+        found: list[ShardedDataset] = []
+
         def converted() -> None:
-            convert(data, out / CONVERTED, **options)
+            found.append(convert(data, out / CONVERTED, **options))
 
         with busy(f"converting the files of {data} to {out / CONVERTED}"):
-            on_first(converted)  # the other ranks wait, and find it done
-        opened = convert(data, out / CONVERTED, **options)
+            on_first(converted)
+        # The other ranks have waited, and find it done where they see the folder.
+        opened = found[0] if found else convert(data, out / CONVERTED, **options)
     free = available_memory()
     if not lazy and (free is None or opened.bytes <= LARGE * free):
         return None
