@@ -84,6 +84,7 @@ def test_at_least_one_demonstration_is_trained_on(log, tmp_path, capsys):
         (["--actions=[torque]", "--low=[-2]"], "give both, or neither"),
         (["--actions=[torque]", "--loss=mae"], "unknown loss of actions 'mae'"),
         (["--actions=[torque]", "--drop=1"], "frames must be a fraction"),
+        (["--actions=[torque]", "--starts=2"], "starts must be a fraction from 0 to 1"),
         (["--actions=[torque]", "--validation=1"], "validation must be a fraction"),
         (["--actions=[torque]", "--model=grub"], "unknown model 'grub'"),
     ],

@@ -22,6 +22,7 @@ def clone_command(
     loss: str = "mse",
     epochs: int = 200,
     window: int = 50,
+    starts: float = 0.1,
     learning_rate: float = 0.01,
     validation: float = 0.15,
     reader: dict[str, Any] | None = None,
@@ -45,6 +46,7 @@ def clone_command(
         loss: loss of the actions, mse or nll.
         epochs: passes over the demonstrations.
         window: rows of each training window.
+        starts: fraction of the windows that begin where a demonstration does, as a rollout does.
         learning_rate: learning rate at the start.
         validation: fraction of the demonstrations by which the best epoch is chosen; 0 keeps the
             last one.
@@ -70,6 +72,7 @@ def clone_command(
         loss=loss,  # type: ignore[arg-type]  # it is checked there
         epochs=epochs,
         window=window,
+        starts=starts,
         learning_rate=learning_rate,
         seed=seed,
     )
