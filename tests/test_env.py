@@ -102,6 +102,18 @@ def test_outages_have_the_lengths_and_the_fraction_of_the_time_that_were_asked_f
     assert np.quantile(lengths, 0.9) < 0.52
 
 
+@pytest.mark.parametrize("fraction", [0.0, 0.05, 0.6, 0.98])
+@pytest.mark.parametrize("length_s", [(0.1, 0.5), (0.0, 0.01)])
+def test_outages_of_many_times_are_those_of_one_time_after_another(fraction, length_s):
+    times = np.r_[0.0, 0.0, np.cumsum(np.random.default_rng(1).exponential(0.02, 300))]
+    one, many = Outages(fraction, length_s), Outages(fraction, length_s)
+    first, second = np.random.default_rng(2), np.random.default_rng(2)
+    for part in (times[:120], times[120:121], times[121:], times[-1:]):
+        expected = [one.at(t, first) for t in part]
+        assert many.within(part, second).tolist() == expected
+    assert first.random() == second.random()
+
+
 def test_a_delayed_frame_is_an_earlier_observation_under_its_own_stamp():
     seen, true = episode(pendulum(delay_s=0.15), 4)
     assert np.array_equal(seen["values"][4:], true[1:-3])

@@ -72,8 +72,7 @@ class Drops:
             arrives[..., list(group)] &= here[..., None]
         for i, fraction in enumerate(bursts if self.bursts else ()):
             outages = Outages(float(fraction), self.burst_s)
-            out = [outages.at(t, random) for t in times[i] - times[i, 0]]
-            arrives[i, out] = False
+            arrives[i, outages.within(times[i] - times[i, 0], random)] = False
         arrives[:, 0] = True
         return arrives
 
@@ -114,6 +113,21 @@ class Outages:
             self._begin = self._end + random.exponential(pause)
             self._end = self._begin + random.uniform(self.low, self.high)
         return bool(time >= self._begin)
+
+    def within(self, times: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.bool_]:
+        """Which times are in an outage; draws what `at` draws for one after another.
+
+        Args:
+            times: (rows,) s, in order, not before the time of the last call.
+            random: that outages are drawn from.
+        """
+        begins, ends, last = [self._begin], [self._end], times.max(initial=-np.inf)
+        while self.fraction and last >= self._end:
+            self.at(self._end, random)
+            begins.append(self._begin)
+            ends.append(self._end)
+        place = np.searchsorted(ends, times, side="right")
+        return (place < len(ends)) & (times >= np.append(begins, np.inf)[place])
 
 
 def check_fraction(name: str, value: float) -> float:

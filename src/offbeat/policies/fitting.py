@@ -206,8 +206,7 @@ def _scaler(
 
 def _rows(model: BaseModel, dataset: Dataset, sensors: list[list[str]] | None) -> _Rows:
     whole = model.batch(dataset)
-    acts = torch.tensor([role == ACTION for role in model.roles], device=whole.mask.device)
-    whole = replace(whole, mask=whole.mask & ~acts)
+    whole = replace(whole, mask=whole.mask & ~_is_action(model, whole))
     seen = [i for i, role in enumerate(model.roles) if role != ACTION]
     names = [model.names[i] for i in seen]
     groups = None
@@ -250,26 +249,46 @@ def _longest_silence(rows: _Rows, drops: Drops, config: CloneConfig) -> float:
     return silence
 
 
-def _predicted(model: BaseModel, batch: Batch) -> Prediction:
-    if isinstance(model, Model):
-        return model.run(model.step_inputs(batch, ends=False)[0])
-    found: Prediction = model(batch)
-    return found
+class _Prepared:
+    """Windows with their step inputs, which do not depend on trained parameters.
+
+    Args:
+        model: that predicts them.
+        windows: of an epoch, or of the validation.
+    """
+
+    def __init__(self, model: BaseModel, windows: Batch) -> None:
+        self.model, self.windows = model, windows
+        self.table = model.prepare(windows) if isinstance(model, Model) else None
+
+    def take(self, index: Tensor) -> tuple[Prediction, Batch]:
+        """The prediction of some windows, and these windows.
+
+        Args:
+            index: (batch,) positions.
+        """
+        some = self.windows.take(index)
+        if self.table is None:
+            return self.model(some), some
+        assert isinstance(self.model, Model)
+        return self.model.run(self.table.take(index)), some
 
 
 class _Validation:
     """The error of the actions of demonstrations, on windows that are drawn once."""
 
     def __init__(self, model: BaseModel, rows: _Rows, drops: Drops, config: CloneConfig) -> None:
-        self.batch = _windows(rows, drops, config, np.random.default_rng([config.seed, 2]))
-        acts = torch.tensor([role == ACTION for role in model.roles])
-        self.counts = self.batch.targets & acts.to(self.batch.mask.device)
+        windows = _windows(rows, drops, config, np.random.default_rng([config.seed, 2]))
+        self.prepared = _Prepared(model, windows)
+        self.every = torch.arange(len(windows), device=windows.mask.device)
+        self.acts = _is_action(model, windows)
 
-    def error(self, model: BaseModel) -> float:
+    def error(self) -> float:
         """Mean squared error, scaled units."""
         with torch.inference_mode():
-            squared = (_predicted(model, self.batch).mean - self.batch.values).square()
-            return float(squared[self.counts].mean())
+            prediction, windows = self.prepared.take(self.every)
+            squared = (prediction.mean - windows.values).square()
+            return float(squared[windows.targets & self.acts].mean())
 
 
 def _fit(
@@ -292,11 +311,11 @@ def _fit(
         optimizer = torch.optim.Adam([parameters.flat], lr=config.learning_rate, foreach=True)
         for epoch in range(config.epochs):
             random = np.random.default_rng([config.seed, 3, epoch])
-            batch = _windows(rows, drops, config, random)
+            prepared = _Prepared(model, _windows(rows, drops, config, random))
+            order = torch.arange(len(prepared.windows), device=rows.whole.mask.device)
             losses = []
-            for first in range(0, len(batch), config.batch_size):
-                some = batch.take(slice(first, first + config.batch_size))
-                loss = _loss(model, some, config.observation_weight)
+            for some in torch.split(order, config.batch_size):
+                loss = _loss(model, *prepared.take(some), config.observation_weight)
                 if not math.isfinite(float(loss.detach())):
                     raise DivergenceError(
                         f"the loss is {float(loss.detach())} in epoch {epoch + 1}; lower the "
@@ -312,7 +331,7 @@ def _fit(
                 losses.append(float(loss.detach()))
                 step += 1
                 bar.update()
-            error = math.nan if judged is None else judged.error(model)
+            error = math.nan if judged is None else judged.error()
             bar.set_postfix_str(f"loss {np.mean(losses):.4f}, validation {error:.4f}")
             if error < best:
                 best, kept = error, {k: v.detach().clone() for k, v in model.state_dict().items()}
@@ -321,10 +340,14 @@ def _fit(
         model.load_state_dict(kept)
 
 
-def _loss(model: BaseModel, batch: Batch, weight: float) -> Tensor:
+def _is_action(model: BaseModel, batch: Batch) -> Tensor:
+    """(channels,) bool, on the device of a batch."""
+    return torch.tensor([role == ACTION for role in model.roles], device=batch.mask.device)
+
+
+def _loss(model: BaseModel, prediction: Prediction, batch: Batch, weight: float) -> Tensor:
     """Of actions at their rows, and of observations before they arrive."""
-    prediction = _predicted(model, batch)
-    acts = torch.tensor([role == ACTION for role in model.roles], device=batch.mask.device)
+    acts = _is_action(model, batch)
     wanted, target = batch.targets, batch.values
     loss = model.loss(prediction, target, (wanted & acts).to(target.dtype))
     if weight:
