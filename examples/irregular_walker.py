@@ -6,9 +6,9 @@
 The recipe is that of Lechner and Hasani 2020 (arXiv:2006.04418), whose files are not available:
 experts of four levels of skill, 1 % random actions, 17 observed values, 10 % of the frames dropped,
 windows of 64 frames that are left. A model is given the frames that are left and their times, and
-predicts the frame after each. Here the experts are linear (`examples.policies.expert`), and by
-default there are fewer rollouts. Errors are mean squared errors of the values as the simulator
-gives them. It needs `offbeat[robots]` and `pip install ncps==1.0.1`.
+predicts the frame after each. The experts are those of `examples.policies.sac`. Errors are mean
+squared errors of the values as the simulator gives them. It needs `offbeat[robots]` and
+`pip install ncps==1.0.1`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from offbeat.files import write_json
 from offbeat.policies import demonstrate
 
 RESULTS = Path("results/robots/irregular_walker")
-LEVELS = {"none": None, "20": "walker2d_20", "40": "walker2d_40", "60": "walker2d"}
-"""Iterations of the search for an expert, and its file; one of no skill does nothing."""
+LEVELS = ("walker2d_sac_80k", "walker2d_sac_330k", "walker2d_sac_360k", "walker2d_sac")
+"""Files of one training of soft actor-critic after 80,000, 330,000, 360,000 and 410,000 steps."""
 FRAMES, STRIDE, DROPPED, RANDOM_ACTIONS = 64, 16, 0.1, 0.01
 FRACTIONS = (0.75, 0.1, 0.15)  # of the rollouts: 300, 40 and 60 of 400
 COMPOSED = {"hidden_size": 64, "init": "fan_in", "field_units": (64, 64)}
+LARGE = {"hidden_size": 128, "field_units": (128, 128)}
 
 
 class Foreign(nn.Module):
@@ -113,8 +114,10 @@ MODELS: dict[str, tuple[str, dict[str, Any]]] = {
     "ODE-GRU-D": ("ode_gru_d", {}),
     "anchored": ("anchored_ode_gru_d", {}),
     "anchored, LSTM": ("anchored_ode_gru_d", {"cell": "lstm"}),
+    "anchored, LSTM, 128 units": ("anchored_ode_gru_d", {"cell": "lstm", **LARGE}),
     "CfC": ("foreign", {"kind": "cfc"}),
     "CfC-mmRNN": ("foreign", {"kind": "cfc_mixed"}),
+    "CfC-mmRNN, 128 units": ("foreign", {"kind": "cfc_mixed", "units": 128}),
     "CfC, change of the last frame": ("foreign", {"kind": "cfc", "change": True}),
     "ODE-LSTM": ("ode_rnn", {"cell": "lstm"}),
     "LTC": ("foreign", {"kind": "ltc"}),
@@ -128,8 +131,8 @@ def made(rollouts: int, stride: int) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset
     """Windows to train, to validate and to test, of different rollouts."""
     each = rollouts // len(LEVELS)
     found = []
-    for i, name in enumerate(LEVELS.values()):
-        act = _nothing if name is None else expert(load_file(HERE / f"{name}.safetensors"))
+    for i, name in enumerate(LEVELS):
+        act = expert(load_file(HERE / f"{name}.safetensors"))
         seed = 100_000 * (i + 1)
         found += list(
             demonstrate(act, "Walker2d-v5", each, seed=seed, random_actions=RANDOM_ACTIONS)
@@ -142,10 +145,6 @@ def made(rollouts: int, stride: int) -> tuple[ob.Dataset, ob.Dataset, ob.Dataset
         ob.Dataset(tuple(w for i in part for w in windows(found[i], random, stride)))
         for part in parts
     )
-
-
-def _nothing(observation: Any) -> Any:
-    return np.zeros((*np.shape(observation)[:-1], 6))
 
 
 def windows(

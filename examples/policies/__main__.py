@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -125,18 +126,19 @@ def main(given: list[str] | None = None) -> None:
     add("--robot", default="pendulum", help=f"one of {', '.join(robots())}")
     add("--seeds", type=int, default=3, help="trainings of each rival")
     add("--training", nargs="+", default=["drops"], choices=TRAININGS, help="what training loses")
-    add(
-        "--starts", type=float, default=0.1, help="fraction of windows from the start of an episode"
-    )
     add("--only", default="", help="names of rivals, separated by semicolons")
     add("--episodes", type=int, default=20)
     add("--steps", type=int, help="that an episode of a test is cut off after")
+    add("--epochs", type=int, help="of a training, in place of the robot's; a folder of its own")
     add("--minutes", type=float, help="stop after the run that is in progress then")
     add("--document", type=Path, help="write the tables into this document instead")
     asked = parser.parse_args(given)
-    robot, folder = robots()[asked.robot], RESULTS / asked.robot
+    robot, key = robots()[asked.robot], asked.robot
+    if asked.epochs is not None:
+        robot, key = replace(robot, epochs=asked.epochs), f"{key}_{asked.epochs}_epochs"
+    folder = RESULTS / key
     if asked.document is not None:
-        report.write(asked.document, folder, asked.robot)
+        report.write(asked.document, folder, key)
         return
     torch.set_num_threads(1)
     stop = time.monotonic() + 60 * (asked.minutes or 1e9)
@@ -183,6 +185,7 @@ def main(given: list[str] | None = None) -> None:
                 "rival": name,
                 "training": training,
                 "seed": seed,
+                "epochs": robot.epochs,
                 "starts": robot.starts,
                 "decoder_units": robot.decoder_units,
                 "returns": found,

@@ -1,8 +1,10 @@
 """Experts for robots of Gymnasium: networks trained by soft actor-critic.
 
-    python -m examples.policies.sac Hopper-v5 --out runs/sac --steps 400000
+    python -m examples.policies.sac Walker2d-v5 --out runs/sac --steps 500000
+    python -m examples.policies.sac Hopper-v5 --algorithm TQC --dropped 5
 
-SAC of Haarnoja et al. 2018 (arXiv:1801.01290) as SBX has it, the JAX sister of Stable-Baselines3
+SAC of Haarnoja et al. 2018 (arXiv:1801.01290), or TQC, which is SAC with critics of quantiles
+(Kuznetsov et al. 2020, arXiv:2005.04269), as SBX has them, the JAX sister of Stable-Baselines3
 (`pip install sbx-rl`), with its own settings but for layers of 128 units, 8 updates every 8
 steps and 10,000 random actions at the start. A training that was stopped goes on from one of its
 last evaluations; its state is pickled by Stable-Baselines3, so `--out` must be a folder that this
@@ -56,7 +58,9 @@ def mean_return(env: Any, act: Any, episodes: int = 10) -> float:
     return total / episodes
 
 
-def train(name: str, folder: Path, steps: int, every: int, random: int, seed: int) -> None:
+def train(
+    name: str, folder: Path, steps: int, every: int, random: int, seed: int, dropped: int | None
+) -> None:
     """Trains up to `steps` of the environment; keeps the best actor by the mean return.
 
     Args:
@@ -66,19 +70,24 @@ def train(name: str, folder: Path, steps: int, every: int, random: int, seed: in
         every: steps between evaluations.
         random: steps of random actions at the start.
         seed: of the training.
+        dropped: the highest quantiles of each critic that TQC leaves out; None for SAC.
     """
-    from sbx import SAC
+    import sbx
 
+    learner, options = sbx.SAC, {}
     at = folder / f"{name}-{seed}"
+    if dropped is not None:
+        learner, options = sbx.TQC, {"top_quantiles_to_drop_per_net": dropped}
+        at = folder / f"{name}-TQC-{seed}"
     at.mkdir(parents=True, exist_ok=True)
     env = gymnasium_env(name, disable_env_checker=True)
     state: dict[str, Any] = {"steps": 0, "best": -np.inf, "log": []}
     if (at / "state.json").exists():
         state = json.loads((at / "state.json").read_text())
-        model = SAC.load(at / "model.zip", env=env)
+        model = learner.load(at / "model.zip", env=env)
         model.load_replay_buffer(at / "buffer.pkl")
     else:
-        model = SAC(
+        model = learner(
             "MlpPolicy",
             env,
             seed=seed,
@@ -87,6 +96,7 @@ def train(name: str, folder: Path, steps: int, every: int, random: int, seed: in
             train_freq=TOGETHER,
             gradient_steps=TOGETHER,
             policy_kwargs={"net_arch": [UNITS] * 2},
+            **options,
         )
     judge = gymnasium_env(name, disable_env_checker=True)
     while state["steps"] < steps:
@@ -118,8 +128,11 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=10_000)
     parser.add_argument("--random", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--algorithm", choices=("SAC", "TQC"), default="SAC")
+    parser.add_argument("--dropped", type=int, default=2, help="quantiles that TQC leaves out")
     given = parser.parse_args()
-    train(given.env, given.out, given.steps, given.every, given.random, given.seed)
+    dropped = given.dropped if given.algorithm == "TQC" else None
+    train(given.env, given.out, given.steps, given.every, given.random, given.seed, dropped)
 
 
 if __name__ == "__main__":
