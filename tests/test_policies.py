@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +25,7 @@ from offbeat.policies import (
     fit_policy,
     rollout,
 )
-from offbeat.policies.fitting import _rows, _windows
+from offbeat.policies.fitting import CloneRecord, _rows, _warn_of_a_rise, _windows
 
 NAMES = ("angle", "speed", "push")
 ROLES = ("state", "state", "action")
@@ -450,6 +451,22 @@ def test_the_best_epoch_is_kept():
         half = (policy.high - policy.low) / 2
         squares.append(((chosen - one.values[:, 2:]) / half) ** 2)
     assert np.mean(squares) == pytest.approx(min(errors), rel=1e-4)
+
+
+@pytest.mark.parametrize(("loss", "start"), [("mse", 1.0), ("nll", 0.0)])
+def test_a_loss_that_rises_for_good_is_warned_of(caplog, loss, start):
+    falls = start - np.linspace(0, 0.9, 40)
+    config = CloneConfig(loss=loss, learning_rate=0.02)
+    for losses, warned in (
+        (falls, False),
+        (np.r_[falls[:20], 5.0, falls[20:]], False),  # it came back
+        (np.r_[falls, np.full(10, falls[-1] + 0.5)], True),
+    ):
+        caplog.clear()
+        log = tuple(CloneRecord(i + 1, float(x), math.nan) for i, x in enumerate(losses))
+        _warn_of_a_rise(log, config)
+        assert bool(caplog.records) == warned
+    assert "lower the learning rate, which is 0.02" in caplog.text
 
 
 class Held(torch.nn.Module):

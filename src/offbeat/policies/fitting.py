@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -29,6 +30,9 @@ from offbeat.run import flat_parameters
 
 ACTION_HEADS = {"mse": "actions", "nll": "gaussian_actions"}
 """Heads of the losses of actions."""
+
+RISE = 1.5
+"""A mean loss at the end this many times as high as the lowest one is warned of."""
 
 COMPOSED = {
     "hidden_size": 32,
@@ -180,6 +184,7 @@ def fit_policy(
     if validation is not None:
         judged = _Validation(made, _rows(made, Dataset.of(validation), sensors), drops, config)
     policy.log = tuple(_fit(made, train, judged, drops, config, progress))
+    _warn_of_a_rise(policy.log, config)
     policy.reset()
     return policy
 
@@ -338,6 +343,27 @@ def _fit(
             yield CloneRecord(epoch + 1, float(np.mean(losses)), error)
     if kept is not None:
         model.load_state_dict(kept)
+
+
+def _warn_of_a_rise(log: tuple[CloneRecord, ...], config: CloneConfig) -> None:
+    """Warns where the loss rose for good, as it does after a step that was too long."""
+    epochs = max(5, len(log) // 10)
+    if len(log) < 4 * epochs:
+        return
+    losses = np.array([record.loss for record in log])
+    if config.loss == "nll":  # of a variance: log s
+        losses = np.exp(2 * losses)
+    means = np.convolve(losses, np.full(epochs, 1 / epochs), "valid")
+    lowest = int(means.argmin())
+    if means[-1] > RISE * means[lowest]:
+        logging.getLogger("offbeat").warning(
+            "the loss of the cloning rose from %.3g around epoch %d to %.3g at the end; lower the "
+            "learning rate, which is %g",
+            log[lowest + epochs // 2].loss,
+            lowest + epochs // 2 + 1,
+            log[-1].loss,
+            config.learning_rate,
+        )
 
 
 def _is_action(model: BaseModel, batch: Batch) -> Tensor:
