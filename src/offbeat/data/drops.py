@@ -120,6 +120,9 @@ class Outages:
         Args:
             times: (rows,) s, in order, not before the time of the last call.
             random: that outages are drawn from.
+
+        Returns:
+            (rows,) True in an outage.
         """
         begins, ends, last = [self._begin], [self._end], times.max(initial=-np.inf)
         while self.fraction and last >= self._end:
