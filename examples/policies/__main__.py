@@ -25,10 +25,10 @@ from offbeat.data.robots import gymnasium_env
 from offbeat.data.trajectory import Dataset
 from offbeat.env import UnevenObservations
 from offbeat.files import write_json
-from offbeat.policies import CloneConfig, Drops, HeldController, demonstrate, fit_policy, rollout
+from offbeat.policies import Drops, HeldController, demonstrate, rollout
 
 from . import report
-from .rivals import RIVALS, options_of
+from .rivals import RIVALS
 from .robots import Robot, robots
 
 RESULTS = Path("results/policies")
@@ -38,6 +38,7 @@ TRAININGS = {
     "no drops": Drops(frames=0.0),
 }
 FIRST_SEED = 50_000  # of the tests
+OPTIONS = ("epochs", "learning_rate", "starts", "decoder_units")
 
 
 def conditions(robot: Robot, episodes: int) -> dict[str, list[dict[str, Any]]]:
@@ -162,21 +163,8 @@ def main(given: list[str] | None = None) -> None:
             return
         if train is None:
             train, validation = shown(robot)
-        model, options = options_of(name, robot.decoder_units)
-        config = CloneConfig(
-            epochs=robot.epochs, window=robot.window, starts=robot.starts, seed=seed
-        )
         began = time.process_time()
-        policy = fit_policy(
-            train,
-            model,
-            validation=validation,
-            bounds=([robot.bounds[0]], [robot.bounds[1]]),
-            drops=TRAININGS[training],
-            config=config,
-            progress=False,
-            **options,
-        )
+        policy = robot.clone(name, TRAININGS[training], seed, train=train, validation=validation)
         seconds = time.process_time() - began
         found = tested(policy, robot, asked.episodes, asked.steps)
         write_json(
@@ -185,9 +173,7 @@ def main(given: list[str] | None = None) -> None:
                 "rival": name,
                 "training": training,
                 "seed": seed,
-                "epochs": robot.epochs,
-                "starts": robot.starts,
-                "decoder_units": robot.decoder_units,
+                **{key: getattr(robot, key) for key in OPTIONS},
                 "returns": found,
                 "validation": min(record.validation for record in policy.log),
                 "parameters": sum(p.numel() for p in policy.model.parameters()),

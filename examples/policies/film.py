@@ -18,10 +18,9 @@ from PIL import Image, ImageDraw
 
 from offbeat.data.robots import gymnasium_env
 from offbeat.env import UnevenObservations
-from offbeat.policies import CloneConfig, HeldController, Policy, fit_policy
+from offbeat.policies import HeldController, Policy
 
 from .__main__ import FIRST_SEED, TRAININGS, shown
-from .rivals import options_of
 from .robots import Robot, robots
 
 LEARNERS = ("MLP, last value", "anchored")
@@ -32,16 +31,8 @@ def cloned(robot: Robot, name: str, path: Path) -> Policy:
     if path.exists():
         return Policy.load(path)
     train, validation = shown(robot)
-    model, options = options_of(name, robot.decoder_units)
-    policy = fit_policy(
-        train,
-        model,
-        validation=validation,
-        bounds=([robot.bounds[0]], [robot.bounds[1]]),
-        drops=TRAININGS["all drops"],
-        config=CloneConfig(epochs=robot.epochs, window=robot.window, starts=robot.starts),
-        **options,
-    )
+    drops = TRAININGS["all drops"]
+    policy = robot.clone(name, drops, 0, train=train, validation=validation)
     policy.save(path)
     return policy
 

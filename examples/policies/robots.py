@@ -11,12 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
+from offbeat.data.trajectory import Dataset
+from offbeat.policies import CloneConfig, Drops, Policy, fit_policy
+
 from . import pendulum
+from .rivals import options_of
 
 HERE = Path(__file__).parent
-DEFAULTS: dict[str, Any] = {"starts": 0.1, "decoder_units": (100, 100)}
-"""Those of `fit_policy`. The linear experts, and robots "before", are cloned with windows from
-anywhere and one layer."""
+SHORT: dict[str, Any] = {"starts": 0.1, "decoder_units": (100, 100)}
+"""A tenth of the windows from the start, and two layers. The linear experts, and robots "before",
+are cloned with windows from anywhere and one layer."""
+
+LONG: dict[str, Any] = {
+    **SHORT,
+    "epochs": 320,
+    "learning_rate": 0.003,
+}
+"""Options that experts of two hidden layers are cloned with."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +43,7 @@ class Robot:
         dt: s, between steps.
         names: of the observed channels.
         epochs: of a training.
+        learning_rate: at its start.
         window: rows of the windows.
         encoders: positions of the angle and the velocity of each joint that is driven.
         starts: fraction of the windows that begin where a demonstration does.
@@ -46,10 +58,42 @@ class Robot:
     dt: float
     names: tuple[str, ...] | None = None
     epochs: int = 150
+    learning_rate: float = 0.01
     window: int = 50
     encoders: tuple[tuple[int, int], ...] = ()
     starts: float = 0.0
     decoder_units: tuple[int, ...] = (100,)
+
+    def clone(
+        self, name: str, drops: Drops, seed: int, *, train: Dataset, validation: Dataset
+    ) -> Policy:
+        """A policy of the comparison.
+
+        Args:
+            name: of `RIVALS`.
+            drops: what training loses.
+            seed: of the training.
+            train: demonstrations.
+            validation: demonstrations that the epoch is chosen by.
+        """
+        model, options = options_of(name, self.decoder_units)
+        config = CloneConfig(
+            epochs=self.epochs,
+            window=self.window,
+            starts=self.starts,
+            learning_rate=self.learning_rate,
+            seed=seed,
+        )
+        return fit_policy(
+            train,
+            model,
+            validation=validation,
+            bounds=([self.bounds[0]], [self.bounds[1]]),
+            drops=drops,
+            config=config,
+            progress=False,
+            **options,
+        )
 
 
 def expert(tensors: dict[str, NDArray[Any]]) -> Callable[[Any], Any]:
@@ -88,7 +132,8 @@ def robots() -> dict[str, Robot]:
     ):
         for key, file, options in (
             (name, name, {}),
-            (f"{name}_sac", f"{name}_sac", DEFAULTS),
+            (f"{name}_sac", f"{name}_sac", LONG),
+            (f"{name}_sac_short", f"{name}_sac", SHORT),
             (f"{name}_sac_before", f"{name}_sac", {}),
         ):
             path = HERE / f"{file}.safetensors"

@@ -181,9 +181,7 @@ class UnevenObservations(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArg
         lost, delay, jitter = self._random.random(3)
         missing = self._random.random(len(self._sensors)) < self._sensor_drop
         out = self._outages.at(now, self._random)
-        mask = np.ones(len(values), dtype=bool)
-        for channels, gone in zip(self._sensors, missing, strict=True):
-            mask[channels] &= not gone
+        mask = ~self._sensors[missing].any(axis=0)
         if out or lost < self._drop or not mask.any():
             return None
         low, high = self._delay
@@ -235,11 +233,15 @@ def name_of(env: Any) -> str:
     return str(env.unwrapped.spec.id if env.unwrapped.spec else env.unwrapped)
 
 
-def _groups(sensors: Sequence[Sequence[int]] | None, channels: int) -> list[NDArray[np.int64]]:
+def _groups(sensors: Sequence[Sequence[int]] | None, channels: int) -> NDArray[np.bool_]:
+    """(sensors, channels) which channels each sensor measures."""
     groups = [[i] for i in range(channels)] if sensors is None else [list(s) for s in sensors]
-    for channel in (c for group in groups for c in group):
-        if not 0 <= channel < channels:
-            raise InputError(
-                f"sensors must be positions of channels, 0 to {channels - 1}, got {channel!r}"
-            )
-    return [np.array(group, dtype=np.int64) for group in groups]
+    measures = np.zeros((len(groups), channels), dtype=bool)
+    for row, group in zip(measures, groups, strict=True):
+        for channel in group:
+            if not 0 <= channel < channels:
+                raise InputError(
+                    f"sensors must be positions of channels, 0 to {channels - 1}, got {channel!r}"
+                )
+            row[channel] = True
+    return measures

@@ -332,7 +332,7 @@ class Model(BaseModel):
         if self.config.readout == "last_row":
             shifted = torch.cat([state, after.flatten(1)[:, : -self.spec.state_size]], dim=1)
             read = shifted.view_as(after)
-        found = self.head.decode(read)
+        found = self.head.decode_observations(read) if self.acts else self.head.decode(read)
         if self.acts:
             # An action is chosen at its row, so it is decoded after the observation there.
             now = after

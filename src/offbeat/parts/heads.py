@@ -87,6 +87,10 @@ class Head(nn.Module):
         """(..., state_size) states to a prediction of (..., channels) in scaled units."""
         raise NotImplementedError(f"{type(self).__name__} must define decode")
 
+    def decode_observations(self, state: Tensor) -> Prediction:
+        """As `decode`, where actions are not read, so that a head need not compute them."""
+        return self.decode(state)
+
     def loss(self, prediction: Prediction, target: Tensor, mask: Tensor | None) -> Tensor:
         """Mean squared error over the entries that count.
 
@@ -192,6 +196,12 @@ class Actions(Point):
     def decode(self, state: Tensor) -> Prediction:
         """(..., state_size) to a prediction of (..., channels)."""
         return _bounded(super().decode(state), self._acts)
+
+    def decode_observations(self, state: Tensor) -> Prediction:
+        """(..., state_size) to a prediction whose actions are not those of the policy."""
+        if not self.anchored:
+            return self.decode(state)
+        return Prediction(state[..., : self.channels] * self.std + self.mean)
 
 
 class GaussianActions(Gaussian):
