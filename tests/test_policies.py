@@ -14,6 +14,7 @@ from examples.policies.pendulum import expert as pendulum_expert
 from offbeat.data.drops import Drops
 from offbeat.data.trajectory import ACTION
 from offbeat.data.transforms import Angle, Transforms
+from offbeat.errors import DivergenceError
 from offbeat.parts import Prediction
 from offbeat.policies import (
     CloneConfig,
@@ -25,7 +26,7 @@ from offbeat.policies import (
     fit_policy,
     rollout,
 )
-from offbeat.policies.fitting import CloneRecord, _rows, _warn_of_a_rise, _windows
+from offbeat.policies.fitting import _Retreat, _rows, _windows
 
 NAMES = ("angle", "speed", "push")
 ROLES = ("state", "state", "action")
@@ -454,19 +455,50 @@ def test_the_best_epoch_is_kept():
 
 
 @pytest.mark.parametrize(("loss", "start"), [("mse", 1.0), ("nll", 0.0)])
-def test_a_loss_that_rises_for_good_is_warned_of(caplog, loss, start):
+def test_a_training_whose_loss_rises_goes_back_to_the_lowest_one(caplog, loss, start):
     falls = start - np.linspace(0, 0.9, 40)
-    config = CloneConfig(loss=loss, learning_rate=0.02)
-    for losses, warned in (
-        (falls, False),
-        (np.r_[falls[:20], 5.0, falls[20:]], False),  # it came back
-        (np.r_[falls, np.full(10, falls[-1] + 0.5)], True),
-    ):
-        caplog.clear()
-        log = tuple(CloneRecord(i + 1, float(x), math.nan) for i, x in enumerate(losses))
-        _warn_of_a_rise(log, config)
-        assert bool(caplog.records) == warned
-    assert "lower the learning rate, which is 0.02" in caplog.text
+    flat = torch.zeros(1)
+    retreat = _Retreat(flat, loss)
+    for epoch, one in enumerate(np.r_[falls[:20], falls[19] + 0.3, falls[20:]], 1):
+        flat[:] = epoch
+        assert not retreat.rose(float(one)), "one epoch that comes back is none"
+    rises = np.full(5, falls[-1] + 0.5)
+    rose = []
+    for epoch, one in enumerate(rises, 42):
+        flat[:] = epoch
+        rose.append(retreat.rose(float(one)))
+        if rose[-1]:
+            break
+    assert rose[-1]
+    assert flat == 40
+    assert "going back to epoch 40, with half the learning rate" in caplog.text
+    flat[:] = 99
+    assert retreat.rose(math.nan)
+    assert flat == 40
+    with pytest.raises(DivergenceError, match="lower the learning rate"):
+        _Retreat(flat, loss).rose(math.inf)
+
+
+def test_a_training_goes_on_where_a_step_ruined_the_parameters(caplog, monkeypatch):
+    class Kicked(torch.optim.Adam):
+        steps = 0
+
+        def step(self):
+            super().step()
+            Kicked.steps += 1
+            if Kicked.steps == 41:
+                with torch.no_grad():
+                    self.param_groups[0]["params"][0].normal_(0.0, 10.0)
+
+    config = CloneConfig(epochs=60, window=20, learning_rate=0.05)
+    given = {"config": config, "drops": Drops(0.5), "progress": False, **SMALL}
+    plain = fit_policy(demonstrations(), "anchored_ode_gru_d", **given)
+    assert not caplog.text
+    monkeypatch.setattr(torch.optim, "Adam", Kicked)
+    policy = fit_policy(demonstrations(), "anchored_ode_gru_d", **given)
+    assert "half the learning rate" in caplog.text
+    assert max(record.loss for record in policy.log[30:]) > 0.5
+    assert policy.log[-1].loss < 2 * plain.log[-1].loss + 0.01
 
 
 class Held(torch.nn.Module):

@@ -31,8 +31,11 @@ from offbeat.run import flat_parameters
 ACTION_HEADS = {"mse": "actions", "nll": "gaussian_actions"}
 """Heads of the losses of actions."""
 
-RISE = 1.5
-"""A mean loss at the end this many times as high as the lowest one is warned of."""
+RISE = 2.0
+"""A training goes back where its mean loss is this many times as high as the lowest one."""
+
+RISE_EPOCHS = 5
+"""Epochs of these means."""
 
 COMPOSED = {
     "hidden_size": 32,
@@ -57,7 +60,9 @@ class CloneConfig:
         starts: fraction of the windows that begin where a demonstration does, as every rollout
             does; the others begin anywhere.
         batch_size: windows per step.
-        learning_rate: of Adam, at the start; it decays to 0 along a cosine.
+        learning_rate: of Adam, at the start; it decays to 0 along a cosine. Where the loss rises to
+            twice its lowest value (means of five epochs), the training goes back to the parameters
+            of the lowest one, with half the rate.
         clip_norm: gradients are scaled down to this norm.
         seed: of the weights, the windows and what is lost.
     """
@@ -153,7 +158,7 @@ def fit_policy(
     Raises:
         InputError: there are no actions or no observations, bounds are no bounds, or an option is
             unknown.
-        DivergenceError: the loss is no longer finite.
+        DivergenceError: the loss is no longer finite, and was not for five epochs.
 
     Example:
         >>> policy = fit_policy(demonstrations, "gru_d", drops=Drops(frames=0.8))  # doctest: +SKIP
@@ -184,7 +189,6 @@ def fit_policy(
     if validation is not None:
         judged = _Validation(made, _rows(made, Dataset.of(validation), sensors), drops, config)
     policy.log = tuple(_fit(made, train, judged, drops, config, progress))
-    _warn_of_a_rise(policy.log, config)
     policy.reset()
     return policy
 
@@ -304,38 +308,39 @@ def _fit(
     config: CloneConfig,
     progress: bool,
 ) -> Iterator[CloneRecord]:
-    per_epoch = int(np.ceil(rows.lengths / min(config.window or 10**9, rows.whole.rows)).sum())
-    total = config.epochs * math.ceil(per_epoch / config.batch_size)
-    best, kept, step = math.inf, None, 0
+    windows = int(np.ceil(rows.lengths / min(config.window or 10**9, rows.whole.rows)).sum())
+    steps = math.ceil(windows / config.batch_size)
+    total = config.epochs * steps
+    best, kept = math.inf, None
     with ExitStack() as stack:
         parameters = stack.enter_context(flat_parameters(model))
         stack.enter_context(model.threads())
         bar = stack.enter_context(
             progress_bar(total=total, desc="cloning", unit="step", show=progress)
         )
-        optimizer = torch.optim.Adam([parameters.flat], lr=config.learning_rate, foreach=True)
+        optimizer = torch.optim.Adam([parameters.flat], foreach=True)
+        highest, retreat = config.learning_rate, _Retreat(parameters.flat, config.loss)
         for epoch in range(config.epochs):
             random = np.random.default_rng([config.seed, 3, epoch])
             prepared = _Prepared(model, _windows(rows, drops, config, random))
             order = torch.arange(len(prepared.windows), device=rows.whole.mask.device)
             losses = []
-            for some in torch.split(order, config.batch_size):
+            for step, some in enumerate(torch.split(order, config.batch_size), epoch * steps):
                 loss = _loss(model, *prepared.take(some), config.observation_weight)
-                if not math.isfinite(float(loss.detach())):
-                    raise DivergenceError(
-                        f"the loss is {float(loss.detach())} in epoch {epoch + 1}; lower the "
-                        "learning rate"
-                    )
+                losses.append(float(loss.detach()))
+                if not math.isfinite(losses[-1]):
+                    break
                 parameters.zero_gradient()
                 loss.backward()  # type: ignore[no-untyped-call]
                 torch.nn.utils.clip_grad_norm_([parameters.flat], config.clip_norm)
                 for group in optimizer.param_groups:
                     rate = 0.5 * (1 + math.cos(math.pi * step / total))
-                    group["lr"] = config.learning_rate * rate
+                    group["lr"] = highest * rate
                 optimizer.step()
-                losses.append(float(loss.detach()))
-                step += 1
                 bar.update()
+            if retreat.rose(float(np.mean(losses))):
+                highest /= 2
+                optimizer = torch.optim.Adam([parameters.flat], foreach=True)
             error = math.nan if judged is None else judged.error()
             bar.set_postfix_str(f"loss {np.mean(losses):.4f}, validation {error:.4f}")
             if error < best:
@@ -345,25 +350,54 @@ def _fit(
         model.load_state_dict(kept)
 
 
-def _warn_of_a_rise(log: tuple[CloneRecord, ...], config: CloneConfig) -> None:
-    """Warns where the loss rose for good, as it does after a step that was too long."""
-    epochs = max(5, len(log) // 10)
-    if len(log) < 4 * epochs:
-        return
-    losses = np.array([record.loss for record in log])
-    if config.loss == "nll":  # of a variance: log s
-        losses = np.exp(2 * losses)
-    means = np.convolve(losses, np.full(epochs, 1 / epochs), "valid")
-    lowest = int(means.argmin())
-    if means[-1] > RISE * means[lowest]:
+class _Retreat:
+    """Goes back to the parameters of the lowest loss where the loss rises, as after a long step.
+
+    Args:
+        flat: the parameters.
+        kind: of the loss.
+    """
+
+    def __init__(self, flat: Tensor, kind: str) -> None:
+        self.flat, self.kind, self.epoch = flat, kind, 0
+        self.levels: list[float] = []
+        self.began = flat.detach().clone()
+        self.lowest, self.kept, self.kept_at = math.inf, None, 0
+
+    def rose(self, loss: float) -> bool:
+        """Whether the loss rose, so that the parameters are those of an earlier epoch again.
+
+        Args:
+            loss: mean of an epoch.
+        """
+        self.epoch += 1
+        level = loss
+        if self.kind == "nll":  # of a variance: log s
+            level = math.exp(min(2 * loss, 700.0))
+        self.levels = [*self.levels[1 - RISE_EPOCHS :], level]
+        if math.isfinite(loss):
+            mean = sum(self.levels) / RISE_EPOCHS if len(self.levels) == RISE_EPOCHS else 0.0
+            if 0 < mean < self.lowest:
+                # The loss of an epoch shows that it began well, not that it ended well.
+                self.lowest, self.kept, self.kept_at = mean, self.began, self.epoch - 1
+            if mean <= RISE * self.lowest:
+                self.began = self.flat.detach().clone()
+                return False
+        if self.kept is None:
+            raise DivergenceError(
+                f"the loss is {loss} in epoch {self.epoch}; lower the learning rate"
+            )
         logging.getLogger("offbeat").warning(
-            "the loss of the cloning rose from %.3g around epoch %d to %.3g at the end; lower the "
-            "learning rate, which is %g",
-            log[lowest + epochs // 2].loss,
-            lowest + epochs // 2 + 1,
-            log[-1].loss,
-            config.learning_rate,
+            "the loss of the cloning rose to %.3g in epoch %d: going back to epoch %d, with half "
+            "the learning rate",
+            loss,
+            self.epoch,
+            self.kept_at,
         )
+        with torch.no_grad():
+            self.flat.copy_(self.kept)
+        self.began, self.levels = self.kept, []
+        return True
 
 
 def _is_action(model: BaseModel, batch: Batch) -> Tensor:
