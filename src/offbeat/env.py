@@ -181,7 +181,7 @@ class UnevenObservations(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArg
         lost, delay, jitter = self._random.random(3)
         missing = self._random.random(len(self._sensors)) < self._sensor_drop
         out = self._outages.at(now, self._random)
-        mask = ~self._sensors[missing].any(axis=0)
+        mask: NDArray[np.bool_] = ~(missing @ self._sensors)
         if out or lost < self._drop or not mask.any():
             return None
         low, high = self._delay

@@ -362,7 +362,8 @@ class _Retreat:
         self.flat, self.kind, self.epoch = flat, kind, 0
         self.levels: list[float] = []
         self.began = flat.detach().clone()
-        self.lowest, self.kept, self.kept_at = math.inf, None, 0
+        self.lowest, self.kept_at = math.inf, 0
+        self.kept: Tensor | None = None
 
     def rose(self, loss: float) -> bool:
         """Whether the loss rose, so that the parameters are those of an earlier epoch again.
