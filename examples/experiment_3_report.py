@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from examples.documents import write_between
 from offbeat.comparison.statistics import holm, paired_t
 
 PREDICTORS = (
@@ -173,12 +174,9 @@ def write(document: Path, folder: Path) -> None:
         folder: of the results.
     """
     found = read(folder)
-    marks = ("<!-- experiment 3 -->", "<!-- end of experiment 3 -->")
-    text = document.read_text(encoding="utf-8")
-    before, rest = text.split(marks[0])
-    after = rest.split(marks[1])[1]
-    inside = "\n\n".join([marks[0], errors(found), tests(found), costs(found), marks[1]])
-    document.write_text(before + inside + after, encoding="utf-8")
+    write_between(
+        document, "experiment 3", "\n\n".join([errors(found), tests(found), costs(found)])
+    )
     draw(found, document.parent / "figures" / "experiment_3_curves.png")
 
 

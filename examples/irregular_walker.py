@@ -25,6 +25,7 @@ from safetensors.numpy import load_file
 from torch import Tensor, nn
 
 import offbeat as ob
+from examples.documents import write_between
 from examples.linear_state_space import LRUNetwork
 from examples.policies.robots import HERE, expert
 from examples.real_logs.results import machine
@@ -264,12 +265,7 @@ def main() -> None:
     add("--document", type=Path, help="write the table into this document instead")
     asked = parser.parse_args()
     if asked.document is not None:
-        text = asked.document.read_text(encoding="utf-8")
-        before, rest = text.split("<!-- irregular walker -->")
-        after = rest.split("<!-- end of irregular walker -->")[1]
-        marks = ("<!-- irregular walker -->", "<!-- end of irregular walker -->")
-        inside = f"{marks[0]}\n\n{table(RESULTS)}\n\n{marks[1]}"
-        asked.document.write_text(before + inside + after, encoding="utf-8")
+        write_between(asked.document, "irregular walker", table(RESULTS))
         return
     torch.set_num_threads(1)
     stop = time.monotonic() + 60 * (asked.minutes or 1e9)

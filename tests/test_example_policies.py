@@ -13,7 +13,7 @@ from scipy import stats
 import offbeat as ob
 from examples import irregular_walker
 from examples.linear_state_space import LRU
-from examples.policies import paired
+from examples.policies import paired, report
 from examples.policies.__main__ import conditions
 from examples.policies.measures import distances, swept_error_area
 from examples.policies.robots import expert, robots
@@ -39,6 +39,29 @@ def test_trainings_of_one_seed_are_pairs_and_each_counts_once(tmp_path):
     assert three.test.paired_t.p == pytest.approx(expected.pvalue)
     assert three.difference == pytest.approx(111 - stats.trim_mean([100] * 16 + [103] * 8, 0.25))
     assert 9 <= three.interval[0] < three.difference < three.interval[1] <= 11.5
+
+
+def test_lengths_of_trainings_are_rows_with_the_best_rival(tmp_path):
+    for robot, options in (
+        ("walker2d_sac", {"epochs": 320, "learning_rate": 0.003}),
+        ("walker2d_sac_short", {}),
+    ):
+        folder = tmp_path / robot
+        folder.mkdir()
+        scores = {"expert": 200.0, "random": 0.0}
+        for name, value in scores.items():
+            (folder / f"{name}.json").write_text(json.dumps({"returns": {"0 %": [value] * 4}}))
+        for rival, lost in (("anchored", [150.0, 170.0]), ("GRU-D", [100.0]), ("ODE-RNN", [90.0])):
+            for seed, value in enumerate(lost):
+                returns = {"0 %": [200.0] * 4, "70 %": [value] * 4}
+                record = {"rival": rival, "training": "all drops", "seed": seed, "returns": returns}
+                (folder / f"{rival}-{seed}.json").write_text(json.dumps({**record, **options}))
+    rows = [line.split(" | ") for line in report.lengths(tmp_path).splitlines()[2:]]
+    assert [row[:4] for row in rows] == [
+        ["| walker2d", "80", "0.01", "2"],
+        ["| walker2d", "320", "0.003", "2"],
+    ]
+    assert rows[0][4:] == ["100", "80 (75–85)", "75, 85", "GRU-D, 50 |"]
 
 
 TURN = np.linspace(0, 2 * np.pi, 2001)[:, None]

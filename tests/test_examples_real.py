@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import norm
 
 import offbeat as ob
+from examples.documents import between
 from examples.real_logs import logs, predictors, report, results, scores, tasks
 from examples.real_logs.__main__ import main
 from offbeat.answers.scoring import score_one_step
@@ -331,7 +332,7 @@ def test_the_document_has_the_tables_between_its_markers(ran):
     assert "| last value |" in text
     assert "old" not in text
     with pytest.raises(ob.InputError, match="<!-- g1 -->"):
-        report.document(text, "g1", "body")
+        between(text, "g1", "body")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import offbeat as ob
-from examples.real_logs.report import document as between
+from examples.documents import between
 from offbeat.tables import markdown
 
 from .data import CHANNELS, FRACTIONS, PROTOCOL

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from examples.documents import write_between
 from examples.real_logs.results import machine
 from offbeat.data.robots import gymnasium_env
 from offbeat.data.trajectory import Dataset
@@ -133,7 +134,11 @@ def main(given: list[str] | None = None) -> None:
     add("--epochs", type=int, help="of a training, in place of the robot's; a folder of its own")
     add("--minutes", type=float, help="stop after the run that is in progress then")
     add("--document", type=Path, help="write the tables into this document instead")
+    add("--lengths", type=Path, help="write the table of lengths of trainings into this document")
     asked = parser.parse_args(given)
+    if asked.lengths is not None:
+        write_between(asked.lengths, "lengths", report.lengths(RESULTS))
+        return
     robot, key = robots()[asked.robot], asked.robot
     if asked.epochs is not None:
         robot, key = replace(robot, epochs=asked.epochs), f"{key}_{asked.epochs}_epochs"

@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 import offbeat as ob
+from examples.documents import write_between
 from examples.real_logs.results import machine
 from offbeat.data.drops import Outages
 from offbeat.data.trajectory import ACTION
@@ -165,13 +166,8 @@ def table(folder: Path, joints: str) -> str:
 
 def write(document: Path, folder: Path) -> None:
     """Replaces the tables in a document, between its marks."""
-    text = document.read_text(encoding="utf-8")
-    before, rest = text.split("<!-- arms -->")
-    _, after = rest.split("<!-- end of arms -->")
-    inside = "\n\n".join(table(folder, joints) for joints in ("arms", "hands"))
-    document.write_text(
-        f"{before}<!-- arms -->\n\n{inside}\n\n<!-- end of arms -->{after}", encoding="utf-8"
-    )
+    body = "\n\n".join(table(folder, joints) for joints in ("arms", "hands"))
+    write_between(document, "arms", body)
 
 
 def main(given: list[str] | None = None) -> None:

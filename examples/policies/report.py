@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from examples.documents import write_between
+
 from . import paired
 from .rivals import RIVALS
-from .scores import interquartile, percent, read, records
+from .scores import by_seed, interquartile, percent, read, records
 
 TITLES = {
     "drops": "Trained with frames lost",
@@ -99,6 +101,44 @@ def draw(folder: Path, path: Path) -> None:
     plt.close(figure)
 
 
+def _length(folder: Path) -> tuple[str, bool, str]:
+    """Sorts folders by robot, and those of short trainings first."""
+    robot, kind = folder.name.split("_sac")
+    return robot, not kind, kind
+
+
+def lengths(results: Path) -> str:
+    """A Markdown table: what the length and the rate of a training do to the anchored model.
+
+    Args:
+        results: with a folder per robot and length.
+    """
+    lines = [
+        "| robot | epochs | rate | trainings | anchored, 0 % | 70 % | each | next, 70 % |",
+        "|---" * 8 + "|",
+    ]
+    for folder in sorted(results.glob("*_sac*"), key=_length):
+        scores = {c: by_seed(folder, "all drops", c) for c in ("0 %", "70 %")}
+        if folder.name.endswith("before") or "anchored" not in scores["70 %"]:
+            continue
+        record = next(r for r in records(folder) if r["rival"] == "anchored")
+        means = {
+            name: interquartile(np.array(list(each.values())))
+            for name, each in scores["70 %"].items()
+        }
+        best = max((name for name in means if name != "anchored"), key=lambda n: means[n][0])
+        own = scores["70 %"]["anchored"]
+        nothing = interquartile(np.array(list(scores["0 %"]["anchored"].values())))[0]
+        mean, low, high = means["anchored"]
+        each = ", ".join(f"{interquartile(own[seed][None])[0]:.0f}" for seed in sorted(own))
+        lines.append(
+            f"| {folder.name.split('_sac')[0]} | {record.get('epochs', 80)} "
+            f"| {record.get('learning_rate', 0.01)} | {len(own)} | {nothing:.0f} "
+            f"| {mean:.0f} ({low:.0f}–{high:.0f}) | {each} | {best}, {means[best][0]:.0f} |"
+        )
+    return "\n".join(lines)
+
+
 def write(document: Path, folder: Path, robot: str) -> None:
     """Replaces the tables of a robot in a document, between its marks, and draws its figure.
 
@@ -111,11 +151,5 @@ def write(document: Path, folder: Path, robot: str) -> None:
     tables = [table(folder, training) for training in TITLES if training in run]
     with_losses = next(training for training in TITLES if training in run)
     tables.append(paired.table(folder, with_losses, "70 %"))
-    text = document.read_text(encoding="utf-8")
-    before, rest = text.split(f"<!-- {robot} -->")
-    _, after = rest.split(f"<!-- end of {robot} -->")
-    inside = "\n\n".join(tables)
     draw(folder, document.parent / "figures" / f"policies_{robot}.png")
-    document.write_text(
-        f"{before}<!-- {robot} -->\n\n{inside}\n\n<!-- end of {robot} -->{after}", encoding="utf-8"
-    )
+    write_between(document, robot, "\n\n".join(tables))

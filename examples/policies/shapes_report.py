@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import wilcoxon
 
+from examples.documents import write_between
+
 STARTS = {"seen": "seen start", "unseen": "unseen start", "pushed": "pushed", "lost": "frames lost"}
 REFERENCE = "kernel ridge, attracted"
 FRACTIONS = (0.3, 1.0)
@@ -107,11 +109,5 @@ def draw(folder: Path, path: Path, shapes: int = 6) -> None:
 
 def write(document: Path, folder: Path) -> None:
     """Replaces the table in a document, between its marks, and draws the figure beside it."""
-    text = document.read_text(encoding="utf-8")
-    before, rest = text.split("<!-- lasa -->")
-    _, after = rest.split("<!-- end of lasa -->")
-    document.write_text(
-        f"{before}<!-- lasa -->\n\n{table(folder)}\n\n<!-- end of lasa -->{after}",
-        encoding="utf-8",
-    )
+    write_between(document, "lasa", table(folder))
     draw(folder, document.parent / "figures" / "lasa_traced.png")

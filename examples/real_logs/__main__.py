@@ -8,6 +8,8 @@ from pathlib import Path
 
 import torch
 
+from examples.documents import between
+
 from . import report
 from .figures import draw_calibration
 from .logs import LOGS, MissingLogError
@@ -64,10 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (files[0].parent / f"{'quick_' if options.quick else ''}tables.md").write_text(every)
         if options.document:
             text = options.document.read_text(encoding="utf-8")
-            options.document.write_text(report.document(text, name, body), encoding="utf-8")
+            options.document.write_text(between(text, name, body), encoding="utf-8")
     if options.readme and front:
         text = options.readme.read_text(encoding="utf-8")
-        page = report.document(text, "real logs", report.front_page(front))
+        page = between(text, "real logs", report.front_page(front))
         options.readme.write_text(page, encoding="utf-8")
     if missing:
         raise SystemExit("\n".join(missing))

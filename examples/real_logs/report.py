@@ -6,31 +6,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from offbeat.errors import InputError
-
 from .predictors import ORACLE, ORACLE_TWO_SIDED
 from .results import Intervals, Summary
 from .scores import BAND, Against
-
-
-def document(text: str, name: str, body: str) -> str:
-    """Puts a body between the markers `<!-- NAME -->` and `<!-- end of NAME -->` of a text.
-
-    Args:
-        text: with both markers.
-        name: of the markers.
-        body: replaces what is between them.
-
-    Raises:
-        InputError: a marker is missing.
-    """
-    start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    before, found, rest = text.partition(start)
-    _, closed, after = rest.partition(end)
-    if not found or not closed:
-        raise InputError(f"the document has no {start} followed by {end}; add both")
-    return f"{before}{start}\n\n{body.strip()}\n\n{end}{after}"
-
 
 FRONT_PAGE = {
     "forecast 0.5 s": (
