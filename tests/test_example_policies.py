@@ -55,13 +55,14 @@ def test_lengths_of_trainings_are_rows_with_the_best_rival(tmp_path):
             for seed, value in enumerate(lost):
                 returns = {"0 %": [200.0] * 4, "70 %": [value] * 4}
                 record = {"rival": rival, "training": "all drops", "seed": seed, "returns": returns}
+                record["validation"] = 0.02 + 0.01 * seed
                 (folder / f"{rival}-{seed}.json").write_text(json.dumps({**record, **options}))
     rows = [line.split(" | ") for line in report.lengths(tmp_path).splitlines()[2:]]
     assert [row[:4] for row in rows] == [
         ["| walker2d", "80", "0.01", "2"],
         ["| walker2d", "320", "0.003", "2"],
     ]
-    assert rows[0][4:] == ["100", "80 (75–85)", "75, 85", "GRU-D, 50 |"]
+    assert rows[0][4:] == ["0.0250", "100", "80 (75–85)", "75, 85", "GRU-D, 50 |"]
 
 
 TURN = np.linspace(0, 2 * np.pi, 2001)[:, None]

@@ -132,6 +132,7 @@ def main(given: list[str] | None = None) -> None:
     add("--episodes", type=int, default=20)
     add("--steps", type=int, help="that an episode of a test is cut off after")
     add("--epochs", type=int, help="of a training, in place of the robot's; a folder of its own")
+    add("--learning_rate", type=float, help="in place of the robot's; a folder of its own")
     add("--minutes", type=float, help="stop after the run that is in progress then")
     add("--document", type=Path, help="write the tables into this document instead")
     add("--lengths", type=Path, help="write the table of lengths of trainings into this document")
@@ -142,6 +143,9 @@ def main(given: list[str] | None = None) -> None:
     robot, key = robots()[asked.robot], asked.robot
     if asked.epochs is not None:
         robot, key = replace(robot, epochs=asked.epochs), f"{key}_{asked.epochs}_epochs"
+    if asked.learning_rate is not None:
+        robot = replace(robot, learning_rate=asked.learning_rate)
+        key = f"{key}_rate_{asked.learning_rate:g}"
     folder = RESULTS / key
     if asked.document is not None:
         report.write(asked.document, folder, key)

@@ -101,12 +101,6 @@ def draw(folder: Path, path: Path) -> None:
     plt.close(figure)
 
 
-def _length(folder: Path) -> tuple[str, bool, str]:
-    """Sorts folders by robot, and those of short trainings first."""
-    robot, kind = folder.name.split("_sac")
-    return robot, not kind, kind
-
-
 def lengths(results: Path) -> str:
     """A Markdown table: what the length and the rate of a training do to the anchored model.
 
@@ -114,14 +108,18 @@ def lengths(results: Path) -> str:
         results: with a folder per robot and length.
     """
     lines = [
-        "| robot | epochs | rate | trainings | anchored, 0 % | 70 % | each | next, 70 % |",
-        "|---" * 8 + "|",
+        "| robot | epochs | rate | trainings | validation | anchored, 0 % | 70 % | each "
+        "| next, 70 % |",
+        "|---" * 9 + "|",
     ]
-    for folder in sorted(results.glob("*_sac*"), key=_length):
+    rows = []
+    for folder in results.glob("*_sac*"):
         scores = {c: by_seed(folder, "all drops", c) for c in ("0 %", "70 %")}
         if folder.name.endswith("before") or "anchored" not in scores["70 %"]:
             continue
-        record = next(r for r in records(folder) if r["rival"] == "anchored")
+        trained = [r for r in records(folder) if r["rival"] == "anchored"]
+        trained = [r for r in trained if r["training"] == "all drops"]
+        record, error = trained[0], np.mean([r["validation"] for r in trained])
         means = {
             name: interquartile(np.array(list(each.values())))
             for name, each in scores["70 %"].items()
@@ -131,12 +129,14 @@ def lengths(results: Path) -> str:
         nothing = interquartile(np.array(list(scores["0 %"]["anchored"].values())))[0]
         mean, low, high = means["anchored"]
         each = ", ".join(f"{interquartile(own[seed][None])[0]:.0f}" for seed in sorted(own))
-        lines.append(
-            f"| {folder.name.split('_sac')[0]} | {record.get('epochs', 80)} "
-            f"| {record.get('learning_rate', 0.01)} | {len(own)} | {nothing:.0f} "
+        robot, epochs = folder.name.split("_sac")[0], record.get("epochs", 80)
+        rate = record.get("learning_rate", 0.01)
+        line = (
+            f"| {robot} | {epochs} | {rate} | {len(own)} | {error:.4f} | {nothing:.0f} "
             f"| {mean:.0f} ({low:.0f}–{high:.0f}) | {each} | {best}, {means[best][0]:.0f} |"
         )
-    return "\n".join(lines)
+        rows.append(((robot, epochs, -rate), line))
+    return "\n".join([*lines, *(line for _, line in sorted(rows))])
 
 
 def write(document: Path, folder: Path, robot: str) -> None:

@@ -22,12 +22,11 @@ SHORT: dict[str, Any] = {"starts": 0.1, "decoder_units": (100, 100)}
 """A tenth of the windows from the start, and two layers. The linear experts, and robots "before",
 are cloned with windows from anywhere and one layer."""
 
-LONG: dict[str, Any] = {
-    **SHORT,
-    "epochs": 320,
-    "learning_rate": 0.003,
-}
+LONG: dict[str, Any] = {**SHORT, "epochs": 320}
 """Options that experts of two hidden layers are cloned with."""
+
+RATES = {"half_cheetah": 0.003}
+"""Learning rates of these other than 0.01, by the validation error."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +131,7 @@ def robots() -> dict[str, Robot]:
     ):
         for key, file, options in (
             (name, name, {}),
-            (f"{name}_sac", f"{name}_sac", LONG),
+            (f"{name}_sac", f"{name}_sac", {**LONG, "learning_rate": RATES.get(name, 0.01)}),
             (f"{name}_sac_short", f"{name}_sac", SHORT),
             (f"{name}_sac_before", f"{name}_sac", {}),
         ):
