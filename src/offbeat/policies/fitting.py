@@ -158,7 +158,7 @@ def fit_policy(
     Raises:
         InputError: there are no actions or no observations, bounds are no bounds, or an option is
             unknown.
-        DivergenceError: the loss is no longer finite, and was not for five epochs.
+        DivergenceError: the loss is no longer finite in one of the first five epochs.
 
     Example:
         >>> policy = fit_policy(demonstrations, "gru_d", drops=Drops(frames=0.8))  # doctest: +SKIP
