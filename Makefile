@@ -29,7 +29,7 @@ demo: .venv/.sim ## install, then run the demo into runs/demo
 
 .PHONY: test
 test: .venv/.test ## install, then run all tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --durations=10 $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --durations=10 $(PYTEST_ARGS)
 
 .PHONY: check
 check: .venv/.test ## install, then lint, check the format and the types

@@ -110,9 +110,9 @@ def multi_rate() -> ob.Dataset:
 
 
 def long_dropouts() -> ob.Dataset:
-    """One sensor is out for up to 12 s of 60, longer than any window that the log has room for."""
-    fast, slow = at(50, 60), at(50, 60) + 0.004
-    values = out(slow, motion(slow, 1, 2), [(10, 22), (40, 46)])
+    """One sensor is out for up to 6 s of 30, longer than any window that the log has room for."""
+    fast, slow = at(25, 30), at(25, 30) + 0.004
+    values = out(slow, motion(slow, 1, 2), [(5, 11), (20, 23)])
     kept = ~np.isnan(values[:, 0])
     times, values = merged((fast, motion(fast)), (slow[kept], values[kept]))
     return log(times, values, ("q0", "q1", "q2", "x", "y"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from offbeat.baselines.weights import (
 )
 from offbeat.data.masking import masked_values
 from offbeat.data.tasks import TaskConfig, draw_tasks
+from offbeat.evaluation import evaluate_blend
 
 
 def waves(seed: int, count: int = 8, rows: int = 200, noise: float = 0.02) -> ob.Dataset:
@@ -260,6 +262,23 @@ def test_intervals_cover(blend, level):
         low, high = answer.interval(level)
         inside.append(((low <= t.values) & (t.values <= high))[masked_values(t)])
     assert np.concatenate(inside).mean() == pytest.approx(level, abs=0.04)
+
+
+def test_an_evaluation_asks_each_baseline_once_about_a_data_set(blend, monkeypatch):
+    asked = Counter()
+
+    def counting(name, predict):
+        def counted(dataset):
+            asked[name] += 1
+            return predict(dataset)
+
+        return counted
+
+    for name, member in (*blend.stack.members.items(), *blend.both.members.items()):
+        monkeypatch.setattr(member, "predict", counting(name, member.predict))
+    evaluate_blend(blend, waves(2, 3), horizons=[0.1])
+    # One step ahead, fills and a forecast; only fills use both sides.
+    assert asked == dict.fromkeys(blend.stack.members, 3) | dict.fromkeys(blend.both.members, 1)
 
 
 def test_intervals_grow_with_the_time_since_observation(blend):

@@ -157,7 +157,7 @@ def test_bursts_and_dropouts_are_silences():
     assert bursts.horizon_s == pytest.approx(0.41)
     assert bursts.split.mask == "bursts"
     long = chosen_for("long_dropouts")
-    assert long.longest_silence_s == pytest.approx(12.0, rel=0.01)
+    assert long.longest_silence_s == pytest.approx(6.0, rel=0.01)
     assert long.horizon_s == 1.0
 
 

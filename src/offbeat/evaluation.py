@@ -9,10 +9,11 @@ from typing import Any, overload
 import torch
 
 from offbeat import tables
-from offbeat.answers.blend import TASKS, Blend, number_of_tasks
+from offbeat.answers.blend import TASKS, Asked, Blend, number_of_tasks
 from offbeat.answers.predict import HasBlend, answering, predicts_any_time
 from offbeat.answers.scoring import (
     ChannelScores,
+    prepared,
     score_forecast,
     score_imputation,
     score_one_step,
@@ -286,12 +287,17 @@ def evaluate_blend(
         InputError: the data has other channels than the blend, or horizons do not fit.
     """
     dataset = Dataset.of(dataset)
-    tasks = [score_one_step(blend, dataset, seed=seed)]
+    asked = Asked(blend, prepared(blend, dataset), seed)
+    tasks = [score_one_step(blend, dataset, seed=seed, asked=asked)]
     masked = dataset
     if not any(masked_values(t).any() for t in dataset):
         count = number_of_tasks(dataset, blend.tasks, TASKS)
         masked = draw_tasks(dataset, blend.tasks, count, shares=TWO_SIDED, seed=[seed, 2])
-    fills = [score_imputation(blend, masked, mode=m, seed=seed) for m in ("causal", "two_sided")]
+        asked = Asked(blend, prepared(blend, masked), seed)
+    fills = [
+        score_imputation(blend, masked, mode=mode, seed=seed, asked=asked)
+        for mode in ("causal", "two_sided")
+    ]
     tasks += [fill.scores for fill in fills]
     after = horizons
     if after is None:

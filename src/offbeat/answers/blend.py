@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -130,16 +131,7 @@ class Blend:
             dataset: transformed, of these channels in this order; masked values are not used.
             seed: of the generator of self-feeding.
         """
-        dataset = self._limited(dataset)
-        models = model_rows(self.forward, dataset, seed=seed)
-        answers = []
-        kinds = kinds_of(self.stack.keys, dataset)
-        every = zip(dataset, self.stack.predict(dataset), kinds, strict=True)
-        for i, (trajectory, base, kind) in enumerate(every):
-            values, beyond = self.corrected(base, None if models is None else models[i], kind)
-            place, unit = self.stack.keys.place(kind), self.stack.keys.unit(kind)
-            answers.append(self._answer(trajectory, values, self.widths, place, unit, beyond))
-        return answers
+        return Asked(self, dataset, seed).causal
 
     def corrected(self, base: Any, model: Any, kind: Any) -> tuple[Any, Any]:
         """The causal answer: base + gamma (model - base), within the range of answers.
@@ -190,14 +182,6 @@ class Blend:
         low, high = as_kind(mean - reach, values), as_kind(mean + reach, values)
         return namespace(values).clip(values, low, high)
 
-    def _limited(self, dataset: Dataset) -> Dataset:
-        reach = FARTHEST * self.stack.scale
-        far = [np.abs(np.nan_to_num(t.values) - self.stack.mean) > reach for t in dataset]
-        if not any(f.any() for f in far):
-            return dataset
-        every = (replace(t, values=self.limited(t.values)) for t in dataset)
-        return replace(dataset, trajectories=tuple(every))
-
     def fill(self, dataset: Dataset, *, seed: int = 0) -> list[Answer]:
         """Predicts every value that is not observed, from the observations on both sides.
 
@@ -205,49 +189,7 @@ class Blend:
             dataset: as of `causal`.
             seed: of the generator of self-feeding.
         """
-        dataset = self._limited(dataset)
-        causal = [answer.values for answer in self.causal(dataset, seed=seed)]
-        models = model_fills(self.forward, self.backward, dataset, seed=seed)
-        channel = np.arange(self.channels)
-        answers = []
-        longest = float(self.both.keys.bins.edges[-1]) * (1 + 1e-6)
-        for trajectory, (values, place) in zip(
-            dataset, self.both.fill(dataset, causal, models), strict=True
-        ):
-            sides = Sides.of(trajectory)
-            near = np.where(sides.before, trajectory.values[sides.earlier, channel], np.nan)
-            near = np.where(sides.before, near, trajectory.values[sides.later, channel])
-            near = np.where(sides.before | sides.after, near, self.stack.mean)
-            values = self.stack.bounded(values, np.nan_to_num(near))
-            unit = self.both.units[place.key, channel]
-            answers.append(
-                self._answer(
-                    trajectory, values, self.both.widths, place, unit, sides.length > longest
-                )
-            )
-        return answers
-
-    def _answer(
-        self,
-        trajectory: Any,
-        values: Array,
-        widths: HalfWidths,
-        place: Place,
-        unit: Array,
-        beyond: NDArray[np.bool_],
-    ) -> Answer:
-        return Answer(
-            trajectory.times,
-            values,
-            names=self.names,
-            units=self.units,
-            roles=self.roles,
-            origin=trajectory.origin,
-            widths=widths,
-            place=place,
-            unit=unit,
-            beyond=beyond,
-        )
+        return Asked(self, dataset, seed).fills
 
     def gamma_table(self) -> str:
         """A plain-text table of gamma per channel and time since observation, in motion as usual.
@@ -303,6 +245,100 @@ class Blend:
         own = {"gamma": self.gamma, "widths": self.widths.table, "widths_count": self.widths.count}
         own |= {f"stack.{k}": v for k, v in self.stack.arrays().items()}
         return own | {f"both.{k}": v for k, v in self.both.arrays().items()}
+
+
+class Asked:
+    """A blend's answers to a data set, and what they are made of; each is computed when first used.
+
+    Args:
+        blend: that is asked.
+        dataset: as of `Blend.causal`.
+        seed: of the generator of self-feeding.
+
+    Attributes:
+        dataset: its values limited as of `Blend.limited`.
+    """
+
+    def __init__(self, blend: Blend, dataset: Dataset, seed: int = 0) -> None:
+        self.blend, self.seed = blend, seed
+        mean, reach = blend.stack.mean, FARTHEST * blend.stack.scale
+        if any((np.abs(np.nan_to_num(t.values) - mean) > reach).any() for t in dataset):
+            every = (replace(t, values=blend.limited(t.values)) for t in dataset)
+            dataset = replace(dataset, trajectories=tuple(every))
+        self.dataset = dataset
+
+    @cached_property
+    def members(self) -> dict[str, list[Array]]:
+        """(rows, channels) per trajectory of each causal baseline."""
+        return {name: m.predict(self.dataset) for name, m in self.blend.stack.members.items()}
+
+    @cached_property
+    def two_sided_members(self) -> dict[str, list[Array]]:
+        """(rows, channels) per trajectory of each baseline of fills from both sides."""
+        return {name: m.predict(self.dataset) for name, m in self.blend.both.members.items()}
+
+    @cached_property
+    def model(self) -> list[Array] | None:
+        """(rows, channels) per trajectory of the forward model, or None without one."""
+        return model_rows(self.blend.forward, self.dataset, seed=self.seed)
+
+    @cached_property
+    def models(self) -> list[Array] | None:
+        """(rows, channels) per trajectory of the models from both sides; see `model_fills`."""
+        return _joined_fills(self.model, self.blend.backward, self.dataset, seed=self.seed)
+
+    @cached_property
+    def causal(self) -> list[Answer]:
+        """See `Blend.causal`."""
+        blend, keys = self.blend, self.blend.stack.keys
+        answers = []
+        for i, kind in enumerate(kinds_of(keys, self.dataset)):
+            base = blend.stack.mixed([rows[i] for rows in self.members.values()], kind)
+            model = None if self.model is None else self.model[i]
+            values, beyond = blend.corrected(base, model, kind)
+            place, unit = keys.place(kind), keys.unit(kind)
+            answers.append(self._answer(i, values, blend.widths, place, unit, beyond))
+        return answers
+
+    @cached_property
+    def fills(self) -> list[Answer]:
+        """See `Blend.fill`."""
+        stack, both, channel = self.blend.stack, self.blend.both, np.arange(self.blend.channels)
+        longest = float(both.keys.bins.edges[-1]) * (1 + 1e-6)
+        members = list(self.two_sided_members.values())
+        filled = both.fill(self.dataset, members, [a.values for a in self.causal], self.models)
+        answers = []
+        for i, (trajectory, (values, place)) in enumerate(zip(self.dataset, filled, strict=True)):
+            sides = Sides.of(trajectory)
+            near = np.where(sides.before, trajectory.values[sides.earlier, channel], np.nan)
+            near = np.where(sides.before, near, trajectory.values[sides.later, channel])
+            near = np.where(sides.before | sides.after, near, stack.mean)
+            values = stack.bounded(values, np.nan_to_num(near))
+            unit, beyond = both.units[place.key, channel], sides.length > longest
+            answers.append(self._answer(i, values, both.widths, place, unit, beyond))
+        return answers
+
+    def _answer(
+        self,
+        i: int,
+        values: Array,
+        widths: HalfWidths,
+        place: Place,
+        unit: Array,
+        beyond: NDArray[np.bool_],
+    ) -> Answer:
+        return Answer(
+            self.dataset[i].times,
+            values,
+            names=self.blend.names,
+            units=self.blend.units,
+            roles=self.blend.roles,
+            origin=self.dataset[i].origin,
+            widths=widths,
+            place=place,
+            unit=unit,
+            beyond=beyond,
+        )
 
 
 def tables_of(arrays: Mapping[str, Array]) -> dict[str, Any]:
@@ -496,7 +532,12 @@ def model_fills(
     forward: BaseModel | None, backward: BaseModel | None, dataset: Dataset, *, seed: int = 0
 ) -> list[Array] | None:
     """The fills of both models joined, or those of the forward model; None without models."""
-    ahead = model_rows(forward, dataset, seed=seed)
+    return _joined_fills(model_rows(forward, dataset, seed=seed), backward, dataset, seed=seed)
+
+
+def _joined_fills(
+    ahead: list[Array] | None, backward: BaseModel | None, dataset: Dataset, *, seed: int
+) -> list[Array] | None:
     if ahead is None or backward is None:
         return ahead
     back = model_rows(backward, reversed_in_time(dataset), seed=seed)

@@ -325,6 +325,7 @@ class BothSides:
     def fill(
         self,
         dataset: Dataset,
+        members: Sequence[Sequence[Array]],
         causal: Sequence[Array],
         models: Sequence[Array] | None,
     ) -> list[tuple[Array, Place]]:
@@ -332,10 +333,11 @@ class BothSides:
 
         Args:
             dataset: in the units and the order of the channels of training.
+            members: per member and trajectory (rows, channels) predictions.
             causal: per trajectory (rows, channels) answers from the past.
             models: the same of `model_fills`, or None without models.
         """
-        every = [member.predict(dataset) for member in self.members.values()] + [list(causal)]
+        every = [*members, causal]
         filled = []
         for i, trajectory in enumerate(dataset):
             place = self.keys.place(trajectory)

@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from offbeat import tables
 from offbeat.answers.answer import Answer
-from offbeat.answers.blend import Blend, model_fills, model_rows
+from offbeat.answers.blend import Asked, Blend, model_rows
 from offbeat.answers.forecast import checked_horizons
 from offbeat.answers.impute import impute
 from offbeat.answers.intervals import LEVELS, crps
 from offbeat.answers.predict import check_any_time
-from offbeat.baselines import Baseline, fill, fillers, forecasters
+from offbeat.baselines import fill, fillers, forecasters
 from offbeat.baselines.history import typical_gap
 from offbeat.calibration import Calibration, CalibrationSums
 from offbeat.data.batch import delta
@@ -292,7 +292,9 @@ class ImputationScores:
         }
 
 
-def score_one_step(model: BaseModel | Blend, dataset: Dataset, *, seed: int = 0) -> ChannelScores:
+def score_one_step(
+    model: BaseModel | Blend, dataset: Dataset, *, seed: int = 0, asked: Asked | None = None
+) -> ChannelScores:
     """Scores the prediction of every row from the rows before it.
 
     Every known value after the first observation of its channel counts, for every predictor.
@@ -301,17 +303,19 @@ def score_one_step(model: BaseModel | Blend, dataset: Dataset, *, seed: int = 0)
         model: a trained model, or a blend, which is scored beside its model and its baselines.
         dataset: masked values are not used as input, and are scored as well.
         seed: of the generator of self-feeding.
+        asked: a blend that was asked about this data set, as `prepared` gives it; by default it
+            is asked anew.
 
     Raises:
         InputError: other channels than the model's.
     """
-    dataset = _prepared(model, dataset)
+    dataset = prepared(model, dataset)
     counted = []
     for t in dataset:
         seen = np.zeros_like(t.observed)
         seen[1:] = np.logical_or.accumulate(t.observed, axis=0)[:-1]
         counted.append(t.known & seen)
-    return _scored("one step ahead", model, dataset, counted, seed=seed)
+    return _scored("one step ahead", model, dataset, counted, seed=seed, asked=asked)
 
 
 def score_imputation(
@@ -320,6 +324,7 @@ def score_imputation(
     *,
     mode: str | None = None,
     seed: int = 0,
+    asked: Asked | None = None,
 ) -> ImputationScores:
     """Scores fills of all masked values: the model's and those of baselines.
 
@@ -330,18 +335,19 @@ def score_imputation(
         dataset: with masked values, from `mask_out`.
         mode: of a blend: `causal`, or, by default, `two_sided`.
         seed: of the generator of self-feeding.
+        asked: as of `score_one_step`.
 
     Raises:
         InputError: nothing is masked, or other channels than the model's.
     """
-    dataset = _prepared(model, dataset)
+    dataset = prepared(model, dataset)
     if not any(masked_values(t).any() for t in dataset):
         raise InputError(
             "no value is known and masked, so no fill can be scored; mask some with mask_out "
             "(--observed_fraction)"
         )
     unit = typical_gap(dataset)
-    fills, answers, trivial = _fills(model, dataset, mode or "two_sided", seed)
+    fills, answers, trivial = _fills(model, dataset, mode or "two_sided", seed, asked)
     sums = _sums_for(model)
     grouped: dict[int, ErrorSums] = {}
     for i, trajectory in enumerate(dataset):
@@ -383,7 +389,7 @@ def score_forecast(
         InputError: horizons as of `forecast`, no row can be scored, other channels than the
             model's, or a model that cannot predict at any time.
     """
-    dataset = _prepared(model, dataset)
+    dataset = prepared(model, dataset)
     if isinstance(targets, bool) or not isinstance(targets, int) or targets < 1:
         raise InputError(f"targets must be a number of rows of at least 1, got {targets!r}")
     after: list[float] = checked_horizons(horizons).tolist()
@@ -436,7 +442,16 @@ def forecast_tasks(
 _Predictions = Mapping[str, list[NDArray[np.float64]]]
 
 
-def _prepared(model: BaseModel | Blend, dataset: Dataset) -> Dataset:
+def prepared(model: BaseModel | Blend, dataset: Dataset) -> Dataset:
+    """A data set in the order of a model's channels, transformed as its training data were.
+
+    Args:
+        model: a trained model, or a blend.
+        dataset: with these channels, in any order.
+
+    Raises:
+        InputError: other channels than the model's.
+    """
     dataset = of_channels(Dataset.of(dataset), model.names, model.units)
     return model.transforms.apply(dataset)
 
@@ -448,17 +463,17 @@ def _scored(
     counted: Sequence[NDArray[np.bool_]],
     *,
     seed: int = 0,
+    asked: Asked | None = None,
 ) -> ChannelScores:
     """Scores causal predictions of a data set that is transformed and in the model's order."""
     answers: list[Answer] | None = None
     every: dict[str, list[NDArray[np.float64]]] = {}
     if isinstance(model, Blend):
-        answers = model.causal(dataset, seed=seed)
+        asked = asked or Asked(model, dataset, seed)
+        answers, baselines = asked.causal, asked.members
         every["blend"] = [a.values for a in answers]
-        rows = model_rows(model.forward, dataset, seed=seed)
-        if rows is not None and model.forward is not None:
-            every[f"{model.forward.name} alone"] = rows
-        baselines = {n: m.predict(dataset) for n, m in model.stack.members.items()}
+        if asked.model is not None and model.forward is not None:
+            every[f"{model.forward.name} alone"] = asked.model
     else:
         rows = model_rows(model, dataset, seed=seed)
         assert rows is not None
@@ -476,28 +491,19 @@ def _scored(
 
 
 def _fills(
-    model: BaseModel | Blend, dataset: Dataset, mode: str, seed: int
+    model: BaseModel | Blend, dataset: Dataset, mode: str, seed: int, asked: Asked | None
 ) -> tuple[_Predictions, list[Answer] | None, tuple[str, ...]]:
     """Fills of each predictor, answers with intervals, and which predictors are baselines."""
     if isinstance(model, Blend):
-        ask = model.causal if mode == "causal" else model.fill
-        members: Mapping[str, Baseline] = (
-            model.stack.members if mode == "causal" else model.both.members
-        )
-        answers = ask(dataset, seed=seed)
+        asked = asked or Asked(model, dataset, seed)
+        ahead = mode == "causal"
+        answers = asked.causal if ahead else asked.fills
+        members = asked.members if ahead else asked.two_sided_members
+        rows = asked.model if ahead else asked.models
         every = {"blend": [a.values for a in answers]}
-        rows = (
-            model_rows(model.forward, dataset, seed=seed)
-            if mode == "causal"
-            else model_fills(model.forward, model.backward, dataset, seed=seed)
-        )
         if rows is not None and model.forward is not None:
             every[f"{model.forward.name} alone"] = rows
-        return (
-            {**every, **{n: m.predict(dataset) for n, m in members.items()}},
-            answers,
-            tuple(members),
-        )
+        return {**every, **members}, answers, tuple(members)
     result = {"causal": [t.values for t in impute(model, dataset, seed=seed)]}
     mean = training_mean(model)
     for method in fillers():
