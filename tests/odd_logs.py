@@ -79,7 +79,7 @@ def late_sensor() -> ob.Dataset:
 
 
 def constants() -> ob.Dataset:
-    times = at(50, 60)
+    times = at(20, 60)
     still = np.column_stack([np.full(len(times), 7.25), np.zeros(len(times))])
     return log(times, np.hstack([motion(times), still]), ("q0", "q1", "q2", "gain", "mode"))
 
@@ -154,7 +154,7 @@ def tiny_scales() -> ob.Dataset:
 
 
 def two_episodes() -> ob.Dataset:
-    clocks = at(50, 25), at(50, 40)
+    clocks = at(20, 25), at(20, 40)
     return ob.Dataset(
         tuple(log(times, motion(times, seed))[0] for seed, times in enumerate(clocks))
     )

@@ -154,13 +154,14 @@ def offbeat(log: Log, seed: int, quick: bool) -> Mapping[str, Predictor]:
     Args:
         log: to train on.
         seed: of the initial weights and of the tasks.
-        quick: two epochs of one model, for tests.
+        quick: two epochs of one model and a few baselines, for tests.
     """
     options: dict[str, Any] = {"as_it_is": bool(log.masked), "seed": seed, "progress": False}
     options["budget_s"] = BUDGET_S
     options["baselines"] = [name for name, kind in BASELINES.items() if not kind.slow]
     if quick:
         options |= {"model": MODEL, "training": ob.TrainConfig(epochs=2, seed=seed)}
+        options["baselines"] = ["last_value", "ridge", "linear", "pchip"]
         if not log.masked:
             options["training"] = ob.TrainConfig(epochs=2, seed=seed, tasks_per_epoch=32)
     blend, _, _ = train_blend(log.train, log.validation, log.task_config, **options)
