@@ -71,7 +71,7 @@ class Foreign(nn.Module):
             mixed = {"mixed_memory": True} if kind == "cfc_mixed" else {}
             made = LTC if kind == "ltc" else CfC
             network = made(data.channels, units, batch_first=True, **mixed)
-            if kind == "ltc":  # half the time, which still is the longest by far
+            if kind == "ltc":  # its six steps per frame take the longest by far
                 solver = network.rnn_cell._ode_solver
                 network.rnn_cell._ode_solver = torch.compile(solver, dynamic=False)
             self.network = network

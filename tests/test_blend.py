@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import offbeat as ob
-from offbeat.answers.blend import fit_blend, tables_of
+from offbeat.answers.blend import Asked, fit_blend, tables_of
 from offbeat.answers.both_sides import SideMotion, Sides
 from offbeat.answers.intervals import LEVELS, crps, fit_half_widths, half_width
+from offbeat.answers.scoring import prepared, score_one_step
 from offbeat.baselines.history import AgeBins, filled_bins
 from offbeat.baselines.local_scale import LocalScale
 from offbeat.baselines.stack import LEVELS as MOTIONS
@@ -279,6 +280,14 @@ def test_an_evaluation_asks_each_baseline_once_about_a_data_set(blend, monkeypat
     evaluate_blend(blend, waves(2, 3), horizons=[0.1])
     # One step ahead, fills and a forecast; only fills use both sides.
     assert asked == dict.fromkeys(blend.stack.members, 3) | dict.fromkeys(blend.both.members, 1)
+
+
+def test_answers_to_other_data_are_not_scored(blend):
+    asked = Asked(blend, prepared(blend, waves(2, 3)))
+    assert score_one_step(blend, waves(2, 3), asked=asked) == score_one_step(blend, waves(2, 3))
+    for other in (waves(2, 2), waves(3, 3)):
+        with pytest.raises(ob.InputError, match="other data"):
+            score_one_step(blend, other, asked=asked)
 
 
 def test_intervals_grow_with_the_time_since_observation(blend):

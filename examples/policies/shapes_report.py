@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.stats import wilcoxon
 
 from examples.documents import write_between
+from offbeat.comparison.statistics import holm
 
 STARTS = {"seen": "seen start", "unseen": "unseen start", "pushed": "pushed", "lost": "frames lost"}
 REFERENCE = "kernel ridge, attracted"
@@ -36,6 +38,7 @@ def table(folder: Path) -> str:
     found = _read(folder)
     shapes = sorted({key[0] for key in found})
     learners = list(dict.fromkeys([REFERENCE, *sorted({key[1] for key in found})]))
+    against = _against(found, shapes, learners[1:])
     lines = [
         f"| {len(shapes)} shapes | stamps | "
         + " | ".join(f"{name}: area, Fréchet, DTW" for name in STARTS)
@@ -56,20 +59,28 @@ def table(folder: Path) -> str:
             seconds = np.mean([r["training_seconds"] for r in some])
             lines.append(
                 f"| {learner} | {100 * fraction:.0f} % | {' | '.join(entries)} | {end:.1f} | "
-                f"{_against(found, shapes, learner, fraction)} | {seconds:.0f} |"
+                f"{against.get((learner, fraction), '')} | {seconds:.0f} |"
             )
     return "\n".join(lines)
 
 
-def _against(found: dict[Any, Any], shapes: list[str], learner: str, fraction: float) -> str:
+def _against(
+    found: dict[Any, Any], shapes: list[str], learners: list[str]
+) -> dict[tuple[str, float], str]:
     """On how many shapes the DTW distance from the unseen start is less than that of ridge."""
-    if learner == REFERENCE:
-        return ""
-    own, other = (
-        np.array([_mean(found[s, name, fraction], "unseen start", "dtw") for s in shapes])
-        for name in (learner, REFERENCE)
-    )
-    return f"{(own < other).sum()} (p = {wilcoxon(own, other).pvalue:.2g})"
+    nearer, p_values = {}, {}
+    for learner, fraction in product(learners, FRACTIONS):
+        own, other = (
+            np.array([_mean(found[s, name, fraction], "unseen start", "dtw") for s in shapes])
+            for name in (learner, REFERENCE)
+        )
+        nearer[learner, fraction] = int((own < other).sum())
+        p_values[learner, fraction] = float(wilcoxon(own, other).pvalue)
+    corrected = holm(list(p_values.values()))
+    return {
+        key: f"{count} (p = {p:.2g})"
+        for (key, count), p in zip(nearer.items(), corrected, strict=True)
+    }
 
 
 def draw(folder: Path, path: Path, shapes: int = 6) -> None:

@@ -307,7 +307,7 @@ def score_one_step(
             is asked anew.
 
     Raises:
-        InputError: other channels than the model's.
+        InputError: other channels than the model's, or `asked` is of another blend or data set.
     """
     dataset = prepared(model, dataset)
     counted = []
@@ -338,7 +338,8 @@ def score_imputation(
         asked: as of `score_one_step`.
 
     Raises:
-        InputError: nothing is masked, or other channels than the model's.
+        InputError: nothing is masked, other channels than the model's, or `asked` is of another
+            blend or data set.
     """
     dataset = prepared(model, dataset)
     if not any(masked_values(t).any() for t in dataset):
@@ -469,7 +470,7 @@ def _scored(
     answers: list[Answer] | None = None
     every: dict[str, list[NDArray[np.float64]]] = {}
     if isinstance(model, Blend):
-        asked = asked or Asked(model, dataset, seed)
+        asked = _asked(model, dataset, seed, asked)
         answers, baselines = asked.causal, asked.members
         every["blend"] = [a.values for a in answers]
         if asked.model is not None and model.forward is not None:
@@ -495,7 +496,7 @@ def _fills(
 ) -> tuple[_Predictions, list[Answer] | None, tuple[str, ...]]:
     """Fills of each predictor, answers with intervals, and which predictors are baselines."""
     if isinstance(model, Blend):
-        asked = asked or Asked(model, dataset, seed)
+        asked = _asked(model, dataset, seed, asked)
         ahead = mode == "causal"
         answers = asked.causal if ahead else asked.fills
         members = asked.members if ahead else asked.two_sided_members
@@ -509,6 +510,22 @@ def _fills(
     for method in fillers():
         result[method] = [fill(t, method, mean) for t in dataset]
     return result, None, fillers()
+
+
+def _asked(blend: Blend, dataset: Dataset, seed: int, before: Asked | None) -> Asked:
+    """What was asked before, if it is of this blend and data set; else the blend, asked now."""
+    if before is None:
+        return Asked(blend, dataset, seed)
+    same = before.blend is blend and len(before.dataset) == len(dataset)
+    if not same or any(
+        not (np.array_equal(a.times, b.times) and np.array_equal(a.observed, b.observed))
+        for a, b in zip(before.dataset, dataset, strict=True)
+    ):
+        raise InputError(
+            f"asked is of another blend or of other data ({len(before.dataset)} trajectories, "
+            f"{len(dataset)} are scored); give Asked(blend, prepared(blend, dataset)), or none"
+        )
+    return before
 
 
 def training_mean(model: BaseModel | Blend) -> list[float]:
